@@ -1,0 +1,94 @@
+"""Rigid motions, pinhole projection and point-set alignment.
+
+Transforms are 4x4 matrices named target_from_source. Cameras follow OpenCV (x right, y down, z forward) with pixel
+centres at integer + 0.5.
+
+References: Umeyama, Least-squares estimation of transformation parameters between two point patterns, PAMI 1991.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+WORLD_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
+"""The world's axes (y up, z towards the camera) from the camera's (y down, z away from it)."""
+
+
+def rotation_from_vector(rotation_vector: np.ndarray) -> np.ndarray:
+    """[..., 3] axis times angle in radians -> [..., 3, 3] rotation matrices."""
+    vector = np.asarray(rotation_vector, np.float64)
+    return Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix().reshape(vector.shape[:-1] + (3, 3))
+
+
+def vector_from_rotation(rotation: np.ndarray) -> np.ndarray:
+    """[..., 3, 3] rotation matrices -> [..., 3] axis times angle in radians."""
+    matrix = np.asarray(rotation, np.float64)
+    return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(matrix.shape[:-2] + (3,))
+
+
+def rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """[..., 3, 3] and [..., 3] -> [..., 4, 4]."""
+    rotation, translation = np.asarray(rotation, np.float64), np.asarray(translation, np.float64)
+    transform = np.zeros(rotation.shape[:-2] + (4, 4))
+    transform[..., :3, :3], transform[..., :3, 3], transform[..., 3, 3] = rotation, translation, 1.0
+    return transform
+
+
+def invert_rigid(transform: np.ndarray) -> np.ndarray:
+    """[..., 4, 4] rigid -> its inverse: [R t]^-1 = [R^T -R^T t]."""
+    transposed = np.swapaxes(transform[..., :3, :3], -1, -2)
+    return rigid(transposed, -np.einsum("...ij,...j->...i", transposed, transform[..., :3, 3]))
+
+
+def project(points: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pinhole projection. points [N, 3] mm, pose [4, 4], intrinsics [3, 3] -> pixels [N, 2], depth [N] mm.
+
+    Leading dimensions of the pose broadcast: [F, 4, 4] gives [F, N, 2] and [F, N].
+    """
+    rotation, translation = camera_from_head[..., :3, :3], camera_from_head[..., :3, 3]
+    in_camera = np.einsum("...ij,nj->...ni", rotation, points) + translation[..., None, :]
+    depth = in_camera[..., 2]
+    pixels = in_camera[..., :2] / depth[..., None] * intrinsics[[0, 1], [0, 1]] + intrinsics[:2, 2]
+    return pixels, depth
+
+
+def camera_centres(camera_from_head: np.ndarray) -> np.ndarray:
+    """[F, 4, 4] -> [F, 3]: where the camera stands in head space, mm."""
+    return invert_rigid(camera_from_head)[..., :3, 3]
+
+
+def world_from_head(camera_from_head: np.ndarray, moves: str) -> np.ndarray:
+    """[F, 4, 4] -> [F, 3, 3]: turns head-space directions into the space in which the light stands still.
+
+    moves "head": the camera's axes turned to y up; "camera": head space itself, so the identity.
+    """
+    if moves == "camera":
+        return np.broadcast_to(np.eye(3), camera_from_head.shape[:-2] + (3, 3)).copy()
+    return WORLD_FROM_CAMERA @ camera_from_head[..., :3, :3]
+
+
+def similarity_from_points(
+    source: np.ndarray, target: np.ndarray, with_scale: bool = True, weights: np.ndarray | None = None
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Weighted least-squares similarity target ~ scale * R @ source + t (Umeyama 1991, eqs. 40 to 43).
+
+    source, target [N, 3]; weights [N] or None -> scale, R [3, 3], t [3].
+    """
+    w = np.ones(len(source)) if weights is None else np.asarray(weights, np.float64)
+    w = w / w.sum()
+    mean_source, mean_target = w @ source, w @ target
+    a, b = source - mean_source, target - mean_target
+    u, singular, vt = np.linalg.svd((b * w[:, None]).T @ a)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u * signs @ vt
+    scale = float((singular * signs).sum() / (w[:, None] * a**2).sum()) if with_scale else 1.0
+    return scale, rotation, mean_target - scale * rotation @ mean_source
+
+
+def fibonacci_sphere(count: int) -> np.ndarray:
+    """[count, 3] unit directions, nearly uniform over the sphere (golden-angle spiral), each worth 4 pi / count sr."""
+    index = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * index / count
+    radius, azimuth = np.sqrt(1.0 - z * z), np.pi * (1.0 + 5.0**0.5) * index
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)

@@ -1,0 +1,174 @@
+"""Triangle meshes: normals, Laplacian, subdivision and the map from texels to the surface.
+
+References: Loop, Smooth subdivision surfaces based on triangles, 1987 (Warren's weights); Thuermer and Wuethrich,
+Computing vertex normals from polygonal facets, 1998 (weights by angle).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sparse
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """vertices [V, 3] mm, faces [F, 3], uvs [T, 2] (v up), face_uvs [F, 3] indices into uvs."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    uvs: np.ndarray
+    face_uvs: np.ndarray
+
+    def replace(self, **changes) -> Mesh:
+        """A copy with some arrays exchanged."""
+        return replace(self, **changes)
+
+
+def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[V, 3], [F, 3] -> [F, 3] normals whose length is twice the face's area."""
+    corners = vertices[faces]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def normalised(vectors: np.ndarray) -> np.ndarray:
+    """[..., 3] -> unit length; the zero vector stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-20)
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[V, 3], [F, 3] -> [V, 3] unit normals, faces weighted by their angle at the vertex."""
+    corners = vertices[faces]
+    normals = normalised(face_normals(vertices, faces))
+    total = np.zeros_like(vertices, dtype=np.float64)
+    for k in range(3):
+        to_next = normalised(corners[:, (k + 1) % 3] - corners[:, k])
+        to_last = normalised(corners[:, (k + 2) % 3] - corners[:, k])
+        angle = np.arccos(np.clip((to_next * to_last).sum(1), -1.0, 1.0))
+        weighted = normals * angle[:, None]
+        for axis in range(3):
+            total[:, axis] += np.bincount(faces[:, k], weighted[:, axis], len(vertices))
+    return normalised(total)
+
+
+def uniform_laplacian(faces: np.ndarray, count: int) -> sparse.csr_matrix:
+    """[F, 3] -> [count, count]: I - D^-1 A, so that L @ x is each vertex minus the mean of its neighbours."""
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    adjacency = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    adjacency = ((adjacency + adjacency.T) > 0).astype(np.float64)
+    degree = np.maximum(np.asarray(adjacency.sum(1)).ravel(), 1.0)
+    return (sparse.identity(count) - sparse.diags(1.0 / degree) @ adjacency).tocsr()
+
+
+def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """[F, 3] -> edges [E, 2], edge of each corner pair (01, 12, 20) [F, 3], faces that share the edge [E]."""
+    pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
+    edges, inverse, shared = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
+    return edges, inverse.reshape(-1, 3), shared
+
+
+def _split(faces: np.ndarray, face_edges: np.ndarray, count: int) -> np.ndarray:
+    """Each face becomes three corner faces and a middle one: [F, 3] -> [4 F, 3], the four of a face together."""
+    a, b, c = faces.T
+    ab, bc, ca = count + face_edges.T
+    children = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]])
+    return children.transpose(2, 0, 1).reshape(-1, 3)
+
+
+def midpoint_subdivision(faces: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """Splits each face in four without moving anything: matrix [count + E, count] and faces [4 F, 3]."""
+    edges, face_edges, _ = _edges(faces)
+    rows = np.repeat(np.arange(len(edges)), 2)
+    middle = sparse.coo_matrix((np.full(len(rows), 0.5), (rows, edges.ravel())), shape=(len(edges), count))
+    return sparse.vstack([sparse.identity(count), middle]).tocsr(), _split(faces, face_edges, count)
+
+
+def loop_subdivision(faces: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """One step of Loop subdivision as a matrix: new vertices = matrix @ old, for positions and for blend shapes.
+
+    faces [F, 3], count vertices -> matrix [count + E, count], faces [4 F, 3]. Inner vertices take Warren's weights
+    (3/16 for three neighbours, else 3 / (8 n)); boundary vertices 1/8, 3/4, 1/8; inner edges 3/8, 3/8, 1/8, 1/8.
+    """
+    edges, face_edges, shared = _edges(faces)
+    boundary = shared == 1
+    adjacency = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)).tocsr()
+    rim = sparse.coo_matrix((boundary.astype(float), edges.T), shape=(count, count)).tocsr()
+    adjacency, rim = adjacency + adjacency.T, rim + rim.T
+    degree = np.asarray(adjacency.sum(1)).ravel()
+    on_rim = np.asarray(rim.sum(1)).ravel() > 0
+    beta = np.where(degree == 3, 3.0 / 16.0, 3.0 / (8.0 * np.maximum(degree, 1)))
+    inner = sparse.diags(np.where(on_rim, 0.0, beta)) @ adjacency
+    outer = sparse.diags(np.where(on_rim, 0.125, 0.0)) @ rim
+    old = inner + outer
+    old = old + sparse.diags(1.0 - np.asarray(old.sum(1)).ravel())
+
+    opposite = np.roll(faces, 1, axis=1)
+    across = sparse.coo_matrix((np.ones(faces.size), (face_edges.ravel(), opposite.ravel())), shape=(len(edges), count))
+    rows = np.repeat(np.arange(len(edges)), 2)
+    ends = sparse.coo_matrix((np.ones(len(rows)), (rows, edges.ravel())), shape=(len(edges), count))
+    new = sparse.diags(np.where(boundary, 0.5, 0.375)) @ ends + sparse.diags(np.where(boundary, 0.0, 0.125)) @ across
+    return sparse.vstack([old, new]).tocsr(), _split(faces, face_edges, count)
+
+
+def subdivide(mesh: Mesh) -> Mesh:
+    """One Loop step for the surface, midpoints for its texture coordinates."""
+    geometry, faces = loop_subdivision(mesh.faces, len(mesh.vertices))
+    texture, face_uvs = midpoint_subdivision(mesh.face_uvs, len(mesh.uvs))
+    return Mesh(geometry @ mesh.vertices, faces.astype(np.int32), texture @ mesh.uvs, face_uvs.astype(np.int32))
+
+
+def interpolate(values: np.ndarray, faces: np.ndarray, face_index: np.ndarray, bary: np.ndarray) -> np.ndarray:
+    """Barycentric interpolation: values [V, ...] at face_index [N] with corner weights bary [N, 3] -> [N, ...]."""
+    corners = faces[face_index]
+    weights = bary.reshape(bary.shape + (1,) * (values.ndim - 1)).astype(values.dtype, copy=False)
+    result = values[corners[:, 0]] * weights[:, 0]
+    result += values[corners[:, 1]] * weights[:, 1]
+    result += values[corners[:, 2]] * weights[:, 2]
+    return result
+
+
+def rasterize_uv(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which face covers each texel's centre. -> face [size, size] int32 (-1: none), bary [size, size, 3] float32.
+
+    Row 0 is v = 1. Where faces overlap in UV the one listed first wins.
+    """
+    corners = mesh.uvs[mesh.face_uvs] * [size, -size] + [0.0, size]
+    face = np.full((size, size), -1, np.int32)
+    bary = np.zeros((size, size, 3), np.float32)
+    low = np.clip(np.ceil(corners.min(1) - 0.5), 0, size).astype(int)
+    high = np.clip(np.floor(corners.max(1) - 0.5) + 1, 0, size).astype(int)
+    extent = np.maximum(high - low, 0)
+    for extent_group in np.unique(extent, axis=0):
+        if extent_group.min() == 0:
+            continue
+        members = np.nonzero((extent == extent_group).all(1))[0]
+        for chunk in np.array_split(members, 1 + len(members) * int(extent_group.prod()) // 2_000_000):
+            _rasterize_group(corners[chunk], low[chunk], extent_group, chunk, face, bary)
+    return face, bary
+
+
+def _rasterize_group(corners, low, extent, indices, face, bary) -> None:
+    """Fills face and bary for triangles whose bounding boxes all have the same extent in texels."""
+    x, y = np.meshgrid(np.arange(extent[0]), np.arange(extent[1]))
+    column, row = low[:, 0, None] + x.ravel(), low[:, 1, None] + y.ravel()
+    p = np.stack([column + 0.5, row + 0.5], axis=-1)
+    a, b, c = corners[:, None, 0], corners[:, None, 1], corners[:, None, 2]
+    area = _cross(b - a, c - a)
+    area = np.where(np.abs(area) < 1e-12, np.inf, area)
+    weights = np.stack([_cross(c - b, p - b), _cross(a - c, p - c), _cross(b - a, p - a)], axis=-1) / area[..., None]
+    inside = (weights >= -1e-6).all(-1)
+    which = np.broadcast_to(indices[:, None], inside.shape)[inside]
+    row, column, weights = row[inside], column[inside], weights[inside]
+    order = np.argsort(-which, kind="stable")
+    which, row, column, weights = which[order], row[order], column[order], weights[order]
+    free = (face[row, column] < 0) | (face[row, column] > which)
+    row, column, which, weights = row[free], column[free], which[free], weights[free]
+    face[row, column] = which
+    kept = face[row, column] == which
+    weights = np.clip(weights[kept], 0.0, 1.0)
+    bary[row[kept], column[kept]] = weights / weights.sum(1, keepdims=True)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
