@@ -1,0 +1,77 @@
+"""The tracking stage's picture: the fitted mesh and the landmarks drawn over frames."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from shared.geometry import WORLD_FROM_CAMERA, project, rigid, rotation_from_vector
+from shared.mesh import Mesh, interpolate, normalised, vertex_normals
+from shared.raycast import RayScene, camera_hits
+from shared.tracks import visible_vertices
+
+MESH_COLOUR, LANDMARK_COLOUR = (70, 220, 255), (255, 150, 40)
+
+
+def overlay_strip(
+    pictures: list[np.ndarray], mesh: Mesh, poses: list[np.ndarray], intrinsics: np.ndarray, landmarks_px: np.ndarray
+) -> np.ndarray:
+    """Frames [H, W, 3] uint8 side by side with the mesh's visible edges; landmarks_px [n, 468, 2] -> one picture."""
+    scene = RayScene(mesh.vertices, mesh.faces)
+    drawn = [
+        draw_overlay(picture, mesh, scene, pose, intrinsics, points)
+        for picture, pose, points in zip(pictures, poses, landmarks_px, strict=True)
+    ]
+    return np.concatenate(drawn, axis=1)
+
+
+def draw_overlay(picture, mesh: Mesh, scene: RayScene, camera_from_head, intrinsics, landmarks_px) -> np.ndarray:
+    """One frame with the mesh's edges where they face the camera, and the landmarks as dots."""
+    zoom = max(1, round(720 / picture.shape[0]))
+    canvas = cv2.resize(picture, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
+    visible = visible_vertices(scene, mesh.vertices, mesh.faces, camera_from_head, 0.05)
+    pixels = project(mesh.vertices, camera_from_head, intrinsics)[0] * zoom
+    lines = canvas.copy()
+    for a, b in _coarse_edges(mesh.faces):
+        if visible[a] and visible[b]:
+            cv2.line(lines, _fixed(pixels[a]), _fixed(pixels[b]), MESH_COLOUR, 1, cv2.LINE_AA, 4)
+    canvas = cv2.addWeighted(lines, 0.45, canvas, 0.55, 0.0)
+    for point in landmarks_px * zoom:
+        cv2.circle(canvas, _fixed(point), 16, LANDMARK_COLOUR, -1, cv2.LINE_AA, 4)
+    return canvas
+
+
+def _coarse_edges(faces: np.ndarray) -> np.ndarray:
+    """Edges [E, 2] of the mesh before its last subdivision, whose four children stand together, corners first."""
+    coarse = faces.reshape(-1, 4, 3)
+    corners = np.stack([coarse[:, 0, 0], coarse[:, 1, 1], coarse[:, 2, 2]], axis=1)
+    pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    return np.unique(np.sort(pairs, axis=1), axis=0)
+
+
+def _fixed(point: np.ndarray) -> tuple[int, int]:
+    """Pixels with centres at + 0.5 as OpenCV's fixed point with four fractional bits."""
+    x, y = np.clip((np.asarray(point) - 0.5) * 16.0, -1e6, 1e6)
+    return int(round(x)), int(round(y))
+
+
+def shaded_views(mesh: Mesh, size: int = 480) -> np.ndarray:
+    """The mesh under one lamp from the front, three-quarter and side: [size, 3 size, 3] uint8."""
+    return np.concatenate([_shaded(mesh, np.radians(angle), size) for angle in (0.0, 45.0, 90.0)], axis=1)
+
+
+def _shaded(mesh: Mesh, yaw: float, size: int) -> np.ndarray:
+    centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    turn = WORLD_FROM_CAMERA @ rotation_from_vector(np.array([0.0, yaw, 0.0]))
+    extent = np.ptp(mesh.vertices, axis=0).max()
+    pose = rigid(turn, -turn @ centre + [0.0, 0.0, 6.0 * extent])
+    focal = 0.9 * size * 6.0
+    lens = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+    face, bary, _ = camera_hits(RayScene(mesh.vertices, mesh.faces), pose, lens, size, size)
+    hit = face >= 0
+    normals = interpolate(vertex_normals(mesh.vertices, mesh.faces), mesh.faces, face[hit], bary[hit].astype(float))
+    lamp_in_world = normalised(np.array([-0.5, 0.6, 0.8]))
+    shade = np.clip(normalised(normals) @ (lamp_in_world @ WORLD_FROM_CAMERA @ turn), 0.0, 1.0)
+    picture = np.full((size, size, 3), 40, np.uint8)
+    picture[hit] = (30 + 210 * shade[:, None]).astype(np.uint8)
+    return picture

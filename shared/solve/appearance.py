@@ -1,0 +1,228 @@
+"""Light, albedo, specular intensity and roughness from the samples of a whole clip.
+
+Model of point v, frame f, channel c:  a[v, c] E[v, f, c] + s S[v, f, c], with E the irradiance over pi (visibility and
+all diffuse bounces) and S the specular lobe sum, both linear in the light. Unknown: the light's logarithm, one
+specular intensity s, one roughness, the albedo of each point.
+
+Method. Albedo is eliminated: for any light it is a weighted least-squares solution per point and channel, and only
+the residual that no albedo can explain drives the light (variable projection; Golub and Pereyra 1973, with Kaufman's
+1975 approximation of the derivative). The light takes Gauss-Newton steps, each solved by conjugate gradients with
+products only: a step touches the clip some twenty times and costs about as much as rendering it that often. Specular
+intensity is closed form after the same elimination; roughness a line search. Weights are robust (Cauchy, by
+reweighting) and clipped or crushed samples only push when the model violates what they say. Steps end when frames
+that were held out stop improving.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from shared.brdf import hemispherical_albedo
+from shared.gather import Samples
+from shared.lobes import LobeTable, specular_tables
+from shared.solve.light import FrameLight, LightPriors, resample_light
+from shared.solve.scale import most_likely_irradiance, scale_prior
+from shared.transfer import Nodes, Points, Transfer, nearest_points, node_radiosity
+
+MINIMUM_ALBEDO, MAXIMUM_ALBEDO = 0.003, 1.0
+ROUGHNESS_RANGE = (0.25, 0.7)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """resolutions: cubemap edge per stage of the solve; independent: how many of the samples count as independent
+    evidence against the priors; noise: absolute and relative standard deviation of a sample."""
+
+    resolutions: tuple[int, ...] = (8, 16)
+    steps: int = 8
+    independent: float = 5000.0
+    noise: tuple[float, float] = (0.006, 0.03)
+    priors: LightPriors = field(default_factory=LightPriors)
+    white_sigma: float = 0.15
+    bounce: bool = True
+    specular: bool = True
+    roughness: float = 0.45
+    specular_prior: tuple[float, float] = (0.7, 0.3)
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What the solver looks at: P points seen in F frames.
+
+    points [P] with samples [P, F] and transfer; nodes and their own transfer; directions [J, 3];
+    world_from_head [F, 3, 3]; fitted [F] bool (the other frames are held out); skin [P] bool: where the prior on skin
+    reflectance applies.
+    """
+
+    points: Points
+    samples: Samples
+    transfer: Transfer
+    nodes: Nodes
+    node_transfer: Transfer
+    directions: np.ndarray
+    world_from_head: np.ndarray
+    fitted: np.ndarray
+    skin: np.ndarray
+
+
+@dataclass
+class State:
+    """log_light [6 n^2, 3], specular intensity, roughness, albedo [P, 3], node_albedo [K, 3]."""
+
+    log_light: np.ndarray
+    specular: float
+    roughness: float
+    albedo: np.ndarray
+    node_albedo: np.ndarray
+
+    @property
+    def light(self) -> np.ndarray:
+        """[6 n^2, 3] radiance."""
+        return np.exp(self.log_light)
+
+
+def _channel_first(array: np.ndarray) -> torch.Tensor:
+    """[P, F, 3] -> contiguous [3, P, F]."""
+    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(array, -1, 0)))
+
+
+class AppearanceSolver:
+    """Fits State to a Capture. Tensors inside are channel first: [3, P, F]."""
+
+    def __init__(self, capture: Capture, settings: Settings):
+        self.capture, self.settings = capture, settings
+        samples = capture.samples
+        self.colours = _channel_first(samples.colours)
+        self.limits = _channel_first(samples.limits)
+        self.trust = torch.from_numpy(samples.weight)[None]
+        sigma = settings.noise[0] + settings.noise[1] * self.colours
+        self.precision = 1.0 / (sigma * sigma)
+        self.fitted = torch.from_numpy(capture.fitted.astype(np.float32))
+        self.table = LobeTable(capture.points.normals, capture.transfer.visibility(), capture.directions)
+        self.node_to_point = nearest_points(capture.nodes.points, capture.points)
+        self.direct = torch.from_numpy(capture.transfer.direct.astype(np.float32))
+        self.history: list[dict] = []
+        self.state = self._start()
+        self._set_resolution(settings.resolutions[0])
+
+    # ------------------------------------------------------------------ set-up
+    def _start(self) -> State:
+        """A uniform light of the level that the priors prefer for this radiance."""
+        weight = (self.trust * self._skin()).double()
+        radiance = ((weight * self.colours).sum((1, 2)) / weight.sum()).numpy()
+        open_share = float((self.direct.sum(1) * weight[0].sum(1)).sum() / weight.sum())
+        irradiance = np.exp(most_likely_irradiance(np.log(radiance), self.settings.white_sigma))
+        albedo = radiance / irradiance
+        log_light = np.broadcast_to(np.log(irradiance / open_share), (6 * self.settings.resolutions[0] ** 2, 3)).copy()
+        points, nodes = len(self.capture.points), len(self.capture.nodes.points)
+        specular = self.settings.specular_prior[0] if self.settings.specular else 0.0
+        return State(log_light, specular, self.settings.roughness, np.tile(albedo, (points, 1)), np.tile(albedo, (nodes, 1)))
+
+    def _skin(self) -> torch.Tensor:
+        return torch.from_numpy(self.capture.skin.astype(np.float32))[None, :, None]
+
+    def _set_resolution(self, resolution: int) -> None:
+        self.frame_light = FrameLight(resolution, self.capture.directions, self.capture.world_from_head)
+        if len(self.state.log_light) != self.frame_light.texels:
+            self.state.log_light = resample_light(self.state.log_light, resolution)
+
+    # ------------------------------------------------------------------ forward model
+    def bake(self) -> None:
+        """Transfer with all diffuse bounces for the present albedo [3, P, J], and the lobes for the roughness."""
+        self.baked = self.direct[None].expand(3, -1, -1)
+        if self.settings.bounce:
+            effective = self.state.node_albedo + self.state.specular * hemispherical_albedo(round(self.state.roughness, 3))
+            radiosity = torch.from_numpy(node_radiosity(self.capture.node_transfer, effective)).float()
+            node_direct = torch.from_numpy(self.capture.node_transfer.direct.astype(np.float32))
+            bounce = torch.from_numpy(self.capture.transfer.bounce.astype(np.float32))
+            self.baked = torch.stack([self.direct + bounce @ (radiosity[..., c] @ node_direct) for c in range(3)])
+
+    def bake_lobes(self) -> None:
+        """The specular tables [F, P, J] for the present roughness."""
+        towards = self.capture.samples.towards_camera
+        self.lobes, blocked = specular_tables(self.table, towards, self.state.roughness)
+        share = torch.from_numpy(blocked / np.maximum(self.capture.transfer.blocked, 1e-3)[:, None])
+        self.blocked_share = share[None]
+
+    def forward(self, light: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        """Texels [K, 3] -> irradiance E and reflection S, both [3, P, F]."""
+        along = torch.from_numpy(self.frame_light.along(light))
+        channels = along.permute(2, 0, 1).contiguous()
+        irradiance = torch.bmm(self.baked, channels)
+        if not self.settings.specular:
+            return irradiance, torch.zeros_like(irradiance)
+        reflection = self.reflect(along)
+        indirect = irradiance - torch.bmm(self.direct[None].expand(3, -1, -1), channels)
+        return irradiance, reflection + self.blocked_share * indirect
+
+    def reflect(self, along: torch.Tensor) -> torch.Tensor:
+        frames = along.permute(1, 0, 2).to(torch.bfloat16).contiguous()
+        return torch.bmm(self.lobes, frames).float().permute(2, 1, 0)
+
+    def reflect_adjoint(self, values: torch.Tensor) -> torch.Tensor:
+        """Transpose of the lobe sums: [3, P, F] -> [J, F, 3]."""
+        frames = values.permute(2, 1, 0).to(torch.bfloat16).contiguous()
+        return torch.bmm(self.lobes.transpose(1, 2), frames).float().permute(1, 0, 2)
+
+    def mean_on_skin(self, albedo, irradiance) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Log of the skin's mean albedo [3], log of its mean irradiance [3], and that mean's derivative by the
+        texels' radiance relative to itself [K, 3]."""
+        weight = self.trust * self._skin()
+        total = weight.sum()
+        mean = (weight * irradiance).sum((1, 2)) / total
+        log_albedo = torch.log((weight * albedo).sum((1, 2)) / total)
+        spread = torch.bmm(self.baked.transpose(1, 2), (weight / total / mean[:, None, None]).contiguous())
+        gauge = self.frame_light.adjoint(spread.permute(1, 2, 0).contiguous().numpy())
+        return log_albedo.double().numpy(), torch.log(mean).double().numpy(), gauge
+
+    # ------------------------------------------------------------------ eliminated unknowns
+    def weights(self, model: torch.Tensor | None) -> torch.Tensor:
+        """[3, P, F] inverse variances: trust, robust loss, and zero where a censored sample is satisfied."""
+        weight = self.trust * self.precision
+        if model is None:
+            return weight * (self.limits == 0)
+        satisfied = ((self.limits > 0) & (model >= self.colours)) | ((self.limits < 0) & (model <= self.colours))
+        error = (model - self.colours).square() * self.precision
+        used = (self.trust > 0).expand_as(error)
+        scale = error[used & ~satisfied].median().clamp_min(0.05) / 0.4549
+        return weight * (~satisfied) / (1.0 + error / (6.0 * scale))
+
+    def eliminate(self, irradiance, reflection, weight) -> torch.Tensor:
+        """Albedo [3, P, 1] that fits best given light and specular intensity, from the fitted frames."""
+        weight = weight * self.fitted
+        moment = (weight * irradiance * (self.colours - self.state.specular * reflection)).sum(2, keepdim=True)
+        albedo = moment / ((weight * irradiance * irradiance).sum(2, keepdim=True) + 1e-3)
+        return albedo.clamp(MINIMUM_ALBEDO, MAXIMUM_ALBEDO)
+
+    def _off_albedo(self, values, irradiance, weight) -> torch.Tensor:
+        """values [3, P, F] minus the part along E that a change of albedo would absorb."""
+        along = (weight * irradiance * values).sum(2, keepdim=True)
+        return values - irradiance * along / ((weight * irradiance * irradiance).sum(2, keepdim=True) + 1e-3)
+
+    def fit_specular(self, irradiance, reflection, weight, evidence: float) -> float:
+        """Specular intensity in closed form with albedo eliminated, under its normal prior."""
+        weight = weight * self.fitted
+        pure = self._off_albedo(reflection, irradiance, weight)
+        moment = float((weight * pure * self.colours).sum()) * evidence
+        curvature = float((weight * pure * reflection).sum()) * evidence
+        mean, sigma = self.settings.specular_prior
+        return float(np.clip((moment + mean / sigma**2) / (curvature + 1.0 / sigma**2), 0.0, 2.0))
+
+    def evidence(self, weight: torch.Tensor) -> float:
+        """Scales the data term so that its samples count as settings.independent ones of unit variance."""
+        count = float((weight * self.fitted > 0).sum()) / 3.0
+        return self.settings.independent / max(count, 1.0)
+
+    def residuals(self, model: torch.Tensor) -> tuple[float, float]:
+        """Root mean square residual (linear, trust-weighted, censored) on fitted and on held-out frames."""
+        satisfied = ((self.limits > 0) & (model >= self.colours)) | ((self.limits < 0) & (model <= self.colours))
+        squared = (model - self.colours).square() * (~satisfied)
+        result = []
+        for chosen in (self.fitted, 1.0 - self.fitted):
+            weight = self.trust * chosen
+            result.append(float(((weight * squared).sum() / (3.0 * weight.sum()).clamp_min(1e-9)).sqrt()))
+        return result[0], result[1]

@@ -1,0 +1,184 @@
+"""The head model fitted to tracked points and landmarks: similarity, identity, expression, then a free correction.
+
+Track points carry no names: each pulls its nearest place on the surface along the normal. Landmarks carry names but
+slide over the skin, so they steer the lids, lips and brows and weigh little. The free correction bends the surface to
+the track points as a thin plate (bi-Laplacian), so that it stays the model's where no track is.
+
+References: Chen and Medioni, Object modelling by registration of multiple range images, 1992 (point to plane); Botsch
+and Sorkine, On linear variational surface deformation methods, TVCG 2008.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.optimize import lsq_linear
+from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
+
+from shared.geometry import rotation_from_vector, similarity_from_points
+from shared.head_model import HeadModel
+from shared.mesh import interpolate, uniform_laplacian, vertex_normals
+
+
+@dataclass(frozen=True)
+class HeadFit:
+    """head ~ scale * rotation @ point + translation takes track points to head space; codes and vertices are there.
+
+    vertices [V, 3] mm; identity [50] standard deviations; expression [25] activations.
+    """
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+    identity: np.ndarray
+    expression: np.ndarray
+    vertices: np.ndarray
+
+    def to_head(self, points: np.ndarray) -> np.ndarray:
+        """Track-space points [N, 3] -> head space, mm."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def camera_from_head(self, camera_from_points: np.ndarray) -> np.ndarray:
+        """[F, 4, 4] poses of the track points -> poses of the head, mm."""
+        poses = np.array(camera_from_points, np.float64)
+        poses[:, :3, :3] = camera_from_points[:, :3, :3] @ self.rotation.T
+        poses[:, :3, 3] = self.scale * camera_from_points[:, :3, 3] - poses[:, :3, :3] @ self.translation
+        return poses
+
+
+@dataclass(frozen=True)
+class FitWeights:
+    """How much each kind of evidence counts; deviations in mm (or in the code's own unit)."""
+
+    track_mm: float = 0.3
+    landmark_mm: float = 4.0
+    identity: float = 1.0
+    expression: float = 0.4
+    stiffness: float = 30.0
+
+
+def fit_codes(
+    model: HeadModel, points: np.ndarray, landmarks: np.ndarray, weights: FitWeights, iterations: int = 12
+) -> HeadFit:
+    """Similarity, identity and expression by alternating closest points and one bounded linear solution.
+
+    points [N, 3] and landmarks [468, 3] in track space (NaN rows: unknown).
+    """
+    known = np.isfinite(landmarks[:, 0]) & (model.landmark_weight > 0) & (model.landmark_face >= 0)
+    identity, expression = np.zeros(len(model.identity_basis)), np.zeros(len(model.expression_basis))
+    vertices = model.shape(identity, expression)
+    named = model.landmarks(vertices)
+    scale, rotation, translation = similarity_from_points(
+        landmarks[known], named[known], weights=model.landmark_weight[known]
+    )
+    fit = HeadFit(scale, rotation, translation, identity, expression, vertices)
+    usable = _fit_vertices(model)
+    for step in range(iterations):
+        reach = 15.0 if step < 4 else 6.0
+        fit = _code_step(model, fit, points, landmarks, known, weights, usable, reach)
+    return fit
+
+
+def _code_step(model, fit, points, landmarks, known, weights, usable, reach_mm) -> HeadFit:
+    """One linearised step of similarity and codes; the codes are solved whole, the similarity as an increment."""
+    in_head, normals = fit.to_head(points), vertex_normals(fit.vertices, model.faces)
+    near, offset, weight = _closest(fit.vertices, normals, usable, in_head, reach_mm)
+    basis = np.concatenate([model.identity_basis, model.expression_basis])
+    neutral = model.template
+    n = normals[near]
+    root = np.sqrt(weight)[:, None] / weights.track_mm
+    # n . (x_j + w x p + t + s p) with p the track point in head space, moving towards the surface point
+    centre = in_head.mean(0)
+    arm = in_head - centre
+    moving = np.concatenate([np.cross(arm, n), n, (arm * n).sum(1, keepdims=True)], axis=1)
+    shape_rows = np.einsum("kni,ni->nk", basis[:, near], n)
+    rows = [root * np.concatenate([-moving, shape_rows], axis=1)]
+    rhs = [root[:, 0] * ((in_head - neutral[near]) * n).sum(1)]
+
+    named = fit.to_head(landmarks[known])
+    arm = named - centre
+    at = _landmark_basis(model, basis, known)
+    base = interpolate(neutral, model.faces, model.landmark_face[known], model.landmark_bary[known])
+    gain = np.sqrt(model.landmark_weight[known]) / weights.landmark_mm
+    for axis, unit in enumerate(np.eye(3)):
+        moving = np.concatenate([np.cross(arm, unit), np.tile(unit, (len(arm), 1)), arm[:, [axis]]], axis=1)
+        rows.append(gain[:, None] * np.concatenate([-moving, at[:, :, axis].T], axis=1))
+        rhs.append(gain * (named - base)[:, axis])
+    codes = len(basis)
+    deviation = np.r_[np.full(len(model.identity_basis), weights.identity)]
+    deviation = np.r_[deviation, np.full(len(model.expression_basis), weights.expression)]
+    rows.append(np.concatenate([np.zeros((codes, 7)), np.diag(1.0 / deviation)], axis=1) * np.sqrt(len(points) / 200.0))
+    rhs.append(np.zeros(codes))
+    lower = np.r_[np.full(7, -np.inf), np.full(len(model.identity_basis), -4.0), np.zeros(len(model.expression_basis))]
+    upper = np.r_[np.full(7, np.inf), np.full(len(model.identity_basis), 4.0), np.ones(len(model.expression_basis))]
+    matrix, target = np.concatenate(rows), np.concatenate(rhs)
+    normal = matrix.T @ matrix + 1e-9 * np.eye(7 + codes)
+    factor = np.linalg.cholesky(normal).T
+    solved = lsq_linear(factor, np.linalg.solve(factor.T, matrix.T @ target), (lower, upper), max_iter=60).x
+    return _moved(model, fit, solved, centre)
+
+
+def _moved(model: HeadModel, fit: HeadFit, solved: np.ndarray, centre: np.ndarray) -> HeadFit:
+    """Applies rotation, shift and growth (about centre, head space) and takes over the codes."""
+    turn, grow = rotation_from_vector(solved[:3]), float(np.exp(solved[6]))
+    rotation = turn @ fit.rotation
+    translation = grow * turn @ (fit.translation - centre) + centre + solved[3:6]
+    identity, expression = np.split(solved[7:], [len(model.identity_basis)])
+    vertices = model.shape(identity, expression)
+    return HeadFit(fit.scale * grow, rotation, translation, identity, expression, vertices)
+
+
+def _landmark_basis(model: HeadModel, basis: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Blend shapes [K, V, 3] at the known landmarks [K, L, 3]."""
+    corners = model.faces[model.landmark_face[known]]
+    return np.einsum("klci,lc->kli", basis[:, corners], model.landmark_bary[known])
+
+
+def _fit_vertices(model: HeadModel) -> np.ndarray:
+    """Indices of vertices that tracks may pull: skin, not eyeballs, inner mouth or scalp."""
+    unpulled = [i for i, name in enumerate(model.segment_names) if name in ("eyes", "inner_mouth", "scalp")]
+    faces = model.faces[~np.isin(model.face_segment, unpulled)]
+    return np.unique(faces)
+
+
+def _closest(vertices, normals, usable, points, reach_mm):
+    """Nearest usable vertex of each point, the point's offset along its normal, and a Cauchy weight."""
+    distance, index = cKDTree(vertices[usable]).query(points)
+    near = usable[index]
+    offset = ((points - vertices[near]) * normals[near]).sum(1)
+    spread = 3.0 * np.median(np.abs(offset)) + 0.05
+    return near, offset, (distance < reach_mm) / (1.0 + (offset / spread) ** 2)
+
+
+def fit_surface(model: HeadModel, fit: HeadFit, points: np.ndarray, weights: FitWeights, iterations: int = 5) -> HeadFit:
+    """The free correction: vertices move by a thin plate through the track points [N, 3] (track space)."""
+    count = len(fit.vertices)
+    laplacian = uniform_laplacian(model.faces, count)
+    plate = (laplacian.T @ laplacian).tocsr()
+    usable = _fit_vertices(model)
+    in_head, vertices = fit.to_head(points), fit.vertices
+    for step in range(iterations):
+        stiffness = weights.stiffness * 4.0 ** (iterations - 1 - step)
+        normals = vertex_normals(vertices, model.faces)
+        near, offset, weight = _closest(vertices, normals, usable, in_head, 8.0)
+        load = np.bincount(near, weight, count)
+        pull = np.bincount(near, weight * offset, count)
+        target = (vertices - fit.vertices) + normals * (pull / np.maximum(load, 1e-9))[:, None]
+        matrix = sparse.diags(load) + stiffness * plate + 1e-4 * sparse.identity(count)
+        correction = splu(matrix.tocsc()).solve(load[:, None] * target)
+        vertices = fit.vertices + correction
+    return HeadFit(fit.scale, fit.rotation, fit.translation, fit.identity, fit.expression, vertices)
+
+
+def triangulate(points_px: np.ndarray, camera_from_points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Least-squares points [N, 3] from pixels [F, N, 2] and poses [F, 4, 4] (linear method, Hartley and Zisserman 12.2)."""
+    x = (points_px - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]]
+    pose = camera_from_points[:, None, :3]
+    rows = pose[:, :, :2] - x[..., None] * pose[:, :, 2:]
+    matrix = rows[..., :3].transpose(1, 0, 2, 3).reshape(points_px.shape[1], -1, 3)
+    rhs = -rows[..., 3].transpose(1, 0, 2).reshape(points_px.shape[1], -1)
+    normal = np.swapaxes(matrix, -1, -2) @ matrix + 1e-12 * np.eye(3)
+    return np.linalg.solve(normal, np.swapaxes(matrix, -1, -2) @ rhs[..., None])[..., 0]

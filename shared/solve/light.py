@@ -1,0 +1,77 @@
+"""The unknown light: a cubemap in the logarithm, how each frame sees it, and its regularisers.
+
+The logarithm keeps radiance positive and makes smoothness relative, so that a lamp a thousand times brighter than the
+room costs no more than its edge. Looking the cubemap up along the head-space directions of every frame is one sparse
+matrix; the solver needs only products with it and with its transpose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.envmap import cube_lookup, cube_smoothness, cube_solid_angles
+
+CHANNELS = 3
+
+
+@dataclass(frozen=True)
+class LightPriors:
+    """Weights of the regularisers: smooth on the squared gradient of the log light per steradian's worth of sphere,
+    white on the squared deviation of a texel's log colour from grey (mean over the sphere); edge: log step from which
+    on a difference counts linearly instead of squared, so that lamps keep their edges."""
+
+    smooth: float = 1.0
+    white: float = 1.0
+    edge: float = 0.5
+
+
+class FrameLight:
+    """A cubemap light of a resolution, seen along directions [J, 3] of head space in F frames.
+
+    world_from_head [F, 3, 3] turns head-space directions into the space in which the light stands still.
+    """
+
+    def __init__(self, resolution: int, directions: np.ndarray, world_from_head: np.ndarray):
+        self.resolution, self.texels = resolution, 6 * resolution**2
+        self.shape = (len(directions), len(world_from_head))
+        turned = np.einsum("fij,dj->dfi", world_from_head, directions).reshape(-1, 3)
+        self._lookup = cube_lookup(turned, resolution).astype(np.float32)
+        self._transposed = self._lookup.T.tocsr()
+        self._differences = cube_smoothness(resolution)
+        self._solid = cube_solid_angles(resolution) / (4.0 * np.pi)
+
+    def along(self, light: np.ndarray) -> np.ndarray:
+        """Radiance of the texels [K, C] -> along each direction in each frame [J, F, C] float32."""
+        return (self._lookup @ light.astype(np.float32)).reshape(self.shape + (light.shape[1],))
+
+    def adjoint(self, values: np.ndarray) -> np.ndarray:
+        """The transpose of along: [J, F, C] -> [K, C] float64."""
+        return (self._transposed @ values.reshape(-1, values.shape[-1])).astype(np.float64)
+
+    def prior(self, log_light: np.ndarray, priors: LightPriors) -> tuple[float, np.ndarray, object]:
+        """Cost, gradient [K, C] and Hessian product (a function) of the regularisers at log_light [K, C].
+
+        Pseudo-Huber on neighbour differences, its weights held for the Hessian (iteratively reweighted squares).
+        """
+        step = self._differences @ log_light
+        root = np.sqrt(1.0 + (step / priors.edge) ** 2)
+        weight = priors.smooth / root
+        chroma = log_light - log_light.mean(1, keepdims=True)
+        white = priors.white * self._solid[:, None]
+
+        def product(change: np.ndarray) -> np.ndarray:
+            smooth = self._differences.T @ (weight * (self._differences @ change))
+            return smooth + white * (change - change.mean(1, keepdims=True))
+
+        cost = priors.smooth * priors.edge**2 * float((root - 1.0).sum()) + 0.5 * float((white * chroma**2).sum())
+        return cost, self._differences.T @ (weight * step) + white * chroma, product
+
+
+def resample_light(log_light: np.ndarray, resolution: int) -> np.ndarray:
+    """The log light [6 n^2, C] on a cubemap of another resolution, interpolated bilinearly."""
+    from shared.envmap import cube_directions
+
+    source = round((len(log_light) / 6) ** 0.5)
+    return cube_lookup(cube_directions(resolution), source) @ log_light

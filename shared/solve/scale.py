@@ -1,0 +1,92 @@
+"""The factor per colour channel between light and albedo: what the clip cannot say, said by stated priors.
+
+Twice the light on half the albedo gives the same diffuse picture. Three statements fix the factor, each a normal
+distribution over logarithms:
+
+- skin's luminance: log Y ~ N(mean, 0.45), from reference skins of all tones;
+- skin's chroma lies on the locus of measured skins: log R/G and log B/G are linear in log Y, sigma as found there;
+- the light on the skin is white after the camera's own white balance: log R/G and log B/G ~ N(0, 0.15).
+
+With u [3] the log of the mean irradiance on the skin and y [3] the log of the mean radiance that it returns, albedo is
+exp(y - u) and all of it is one quadratic in u.
+
+References: skin I to VI of the Physically Based database (physicallybased.info, CC0), the same that OpenPBR viewers
+offer; ColorChecker patches "light skin" and "dark skin" (sRGB values of X-Rite, November 2014).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.color import LUMINANCE
+
+REFERENCE_SKINS = np.array(
+    [
+        [0.847, 0.638, 0.552],
+        [0.799, 0.485, 0.347],
+        [0.623, 0.433, 0.343],
+        [0.436, 0.227, 0.131],
+        [0.283, 0.148, 0.079],
+        [0.090, 0.050, 0.020],
+        [0.539, 0.305, 0.223],
+        [0.171, 0.084, 0.058],
+    ]
+)
+"""Linear Rec.709 reflectance of reference skins, light to dark, then the two chart patches."""
+
+LUMINANCE_SIGMA = 0.45
+WHITE_SIGMA = 0.15
+
+
+@dataclass(frozen=True)
+class SkinLocus:
+    """log R/G and log B/G of skin: offset + slope * (log Y - mean_log_luminance), each [2], spread sigma [2]."""
+
+    mean_log_luminance: float
+    offset: np.ndarray
+    slope: np.ndarray
+    sigma: np.ndarray
+
+
+def fit_skin_locus(skins: np.ndarray = REFERENCE_SKINS) -> SkinLocus:
+    """Least-squares line through reference skins [N, 3]; the spread is the residual's, unbiased."""
+    logs = np.log(skins)
+    luminance = np.log(skins @ LUMINANCE)
+    mean = float(np.median(luminance))
+    chroma = logs[:, [0, 2]] - logs[:, [1]]
+    design = np.stack([np.ones_like(luminance), luminance - mean], axis=1)
+    (offset, slope), *_ = np.linalg.lstsq(design, chroma, rcond=None)
+    residual = chroma - design @ np.stack([offset, slope])
+    return SkinLocus(mean, offset, slope, np.sqrt((residual**2).sum(0) / (len(skins) - 2)))
+
+
+def scale_prior(
+    log_radiance: np.ndarray, white_sigma: float = WHITE_SIGMA, locus: SkinLocus | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The priors as residuals A u - b of unit variance in u = log mean irradiance [3], given y = log_radiance [3].
+
+    Luminance enters linearised: d log Y = sum_c share_c d log a_c, with the shares of a typical skin.
+    """
+    locus = locus or fit_skin_locus()
+    typical = np.median(REFERENCE_SKINS, axis=0)
+    share = LUMINANCE * typical / (LUMINANCE @ typical)
+    constant = float(np.log(LUMINANCE @ typical) - share @ np.log(typical))
+    ratio = np.array([[1.0, -1.0, 0.0], [0.0, -1.0, 1.0]])
+    # Rows act on log albedo q = y - u: value = row @ q + const.
+    rows, targets, sigmas = [share], [locus.mean_log_luminance - constant], [LUMINANCE_SIGMA]
+    for k in range(2):
+        rows.append(ratio[k] - locus.slope[k] * share)
+        targets.append(locus.offset[k] + locus.slope[k] * (constant - locus.mean_log_luminance))
+        sigmas.append(locus.sigma[k])
+    rows, targets, sigmas = np.array(rows), np.array(targets), np.array(sigmas)
+    on_skin = -rows / sigmas[:, None]
+    right = (targets - rows @ log_radiance) / sigmas
+    return np.concatenate([on_skin, ratio / white_sigma]), np.concatenate([right, np.zeros(2)])
+
+
+def most_likely_irradiance(log_radiance: np.ndarray, white_sigma: float = WHITE_SIGMA) -> np.ndarray:
+    """u [3]: the log mean irradiance that the priors alone prefer for skin of log mean radiance y [3]."""
+    matrix, right = scale_prior(log_radiance, white_sigma)
+    return np.linalg.lstsq(matrix, right, rcond=None)[0]

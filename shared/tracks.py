@@ -1,0 +1,187 @@
+"""Dense skin tracks: where each patch of skin lies in each frame, to a tenth of a pixel.
+
+Landmark networks slide over the skin as the head turns. Here every frame is warped into the layout of a reference frame
+by a surface that is roughly right (first the landmarks' triangulation, then the fitted head), so that what remains is a
+small motion, found by dense inverse search flow on images of log local contrast: those show skin, not light.
+
+References: Kroeger et al., Fast optical flow using dense inverse search, ECCV 2016; forward-backward check: Kalal et al.,
+Forward-backward error, ICPR 2010.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import Delaunay
+
+from shared.geometry import camera_centres
+from shared.mesh import interpolate, normalised, vertex_normals
+from shared.raycast import RayScene, camera_hits
+
+CRUSHED_CODE, CLIPPED_CODE = 8, 250
+"""8-bit code values at and beyond which a pixel says nothing of the skin's texture."""
+
+
+def local_contrast(grey: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Log image minus its local mean over its local spread: [H, W] uint8 -> [H, W] uint8, 128 is the mean."""
+    log = np.log(grey.astype(np.float32) + 8.0)
+    detail = log - cv2.GaussianBlur(log, (0, 0), sigma_px)
+    spread = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), 1.5 * sigma_px)) + 0.02
+    return np.clip(detail / spread * 45.0 + 128.0, 0, 255).astype(np.uint8)
+
+
+def unusable_pixels(rgb: np.ndarray) -> np.ndarray:
+    """[H, W, 3] uint8 -> [H, W] uint8, 1 where a channel is clipped or all are crushed, grown by two pixels."""
+    bad = (rgb.max(-1) >= CLIPPED_CODE) | (rgb.max(-1) <= CRUSHED_CODE)
+    return cv2.dilate(bad.astype(np.uint8), np.ones((5, 5), np.uint8))
+
+
+@dataclass(frozen=True)
+class SurfaceGrid:
+    """A reference frame's pixels on a surface: corners [h, w, 3] vertex indices, bary [h, w, 3], valid [h, w] bool.
+
+    scale: grid pixels per image pixel; origin: image position of the grid's first corner, px.
+    """
+
+    reference: int
+    corners: np.ndarray
+    bary: np.ndarray
+    valid: np.ndarray
+    scale: float
+
+    def warp(self, values: np.ndarray) -> np.ndarray:
+        """Vertex values [V, C] -> [h, w, C] float32."""
+        taken = values.astype(np.float32)[self.corners]
+        return np.einsum("hwkc,hwk->hwc", taken, self.bary)
+
+
+def grid_from_landmarks(landmarks_px: np.ndarray, reference: int, scale: float) -> SurfaceGrid:
+    """The reference frame's landmarks [468, 2], triangulated, as a surface."""
+    triangles = Delaunay(landmarks_px)
+    low, high = np.floor(landmarks_px.min(0)), np.ceil(landmarks_px.max(0))
+    x, y = np.meshgrid(np.arange(low[0], high[0], 1 / scale), np.arange(low[1], high[1], 1 / scale))
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    simplex = triangles.find_simplex(points)
+    affine = triangles.transform[simplex]
+    first = np.einsum("nij,nj->ni", affine[:, :2], points - affine[:, 2])
+    bary = np.concatenate([first, 1.0 - first.sum(1, keepdims=True)], axis=1)
+    corners = triangles.simplices[simplex]
+    shape = x.shape
+    return SurfaceGrid(
+        reference,
+        corners.reshape(shape + (3,)),
+        bary.reshape(shape + (3,)).astype(np.float32),
+        (simplex >= 0).reshape(shape),
+        scale,
+    )
+
+
+def grid_from_mesh(
+    scene: RayScene,
+    faces: np.ndarray,
+    usable_face: np.ndarray,
+    camera_from_head: np.ndarray,
+    intrinsics: np.ndarray,
+    box: np.ndarray,
+    reference: int,
+    scale: float,
+) -> SurfaceGrid:
+    """What the reference camera [4, 4] sees of the mesh within box (x0, y0, x1, y1 px); usable_face [F] bool."""
+    zoomed = np.array(intrinsics, np.float64)
+    zoomed[:2] *= scale
+    zoomed[:2, 2] -= np.asarray(box[:2]) * scale
+    width, height = (np.ceil((box[2:] - box[:2]) * scale)).astype(int)
+    face, bary, _ = camera_hits(scene, camera_from_head, zoomed, width, height)
+    valid = (face >= 0) & usable_face[np.maximum(face, 0)]
+    return SurfaceGrid(reference, faces[np.maximum(face, 0)], bary, valid, scale)
+
+
+def visible_vertices(
+    scene: RayScene, vertices: np.ndarray, faces: np.ndarray, camera_from_head: np.ndarray, least_cosine: float
+) -> np.ndarray:
+    """[V] bool: faces the camera [4, 4] by at least that cosine, and nothing of the mesh stands between."""
+    normals = vertex_normals(vertices, faces)
+    towards = normalised(camera_centres(camera_from_head) - vertices)
+    seen = (normals * towards).sum(1) > least_cosine
+    index = np.nonzero(seen)[0]
+    seen[index] = ~scene.occluded(vertices[index] + 0.3 * normals[index], towards[index])
+    return seen
+
+
+def dense_tracks(
+    grid: SurfaceGrid,
+    contrast: list[np.ndarray],
+    unusable: list[np.ndarray],
+    positions_px: np.ndarray,
+    visible: np.ndarray,
+    *,
+    count: int,
+    search_px: float,
+    progress=iter,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Tracks of about `count` grid points of the reference through all frames.
+
+    contrast, unusable: F images [H, W]; positions_px [F, V, 2] where the surface's vertices are believed to be;
+    visible [F, V] bool. search_px: the largest believed error. -> tracks [F, N, 2] px (NaN: not found) and the points'
+    (row, column) in the grid [N, 2].
+    """
+    rows, columns = _grid_points(grid, count)
+    tracks = np.full((len(contrast), len(rows), 2), np.nan)
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    layout = grid.warp(positions_px[grid.reference])
+    layout[~grid.valid] = -9.0
+    target = _sample(contrast[grid.reference], layout)
+    usable = (_sample(unusable[grid.reference], layout, cv2.INTER_NEAREST) == 0) & grid.valid
+    for i in progress(range(len(contrast))):
+        shown = grid.warp(visible[i].astype(np.float32)[:, None])[..., 0] > 0.99
+        if shown[rows, columns].sum() < 20:
+            continue
+        layout = grid.warp(positions_px[i])
+        layout[~(grid.valid & shown)] = -9.0
+        image = _sample(contrast[i], layout)
+        masked = np.where(shown & grid.valid, target, 128).astype(np.uint8)
+        image[~(shown & grid.valid)] = 128
+        forward, backward = flow.calc(masked, image, None), flow.calc(image, masked, None)
+        moved = forward[rows, columns]
+        at = np.stack([columns, rows], axis=1).astype(np.float32) + moved
+        returned = moved + _lookup(backward, at)
+        good = np.linalg.norm(returned, axis=1) < 0.3 * grid.scale
+        good &= np.linalg.norm(moved, axis=1) < search_px * grid.scale
+        good &= usable[rows, columns] & shown[rows, columns]
+        found = _lookup(layout, at)
+        good &= (_sample(unusable[i], found[:, None], cv2.INTER_NEAREST)[:, 0] == 0) & (found.min(1) > 0)
+        tracks[i, good] = found[good]
+    return tracks, np.stack([rows, columns], axis=1)
+
+
+def _grid_points(grid: SurfaceGrid, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Evenly spaced grid points well inside the valid region."""
+    margin = max(3, int(round(4 * grid.scale)))
+    inside = cv2.erode(np.pad(grid.valid.astype(np.uint8), 1), np.ones((2 * margin + 1,) * 2, np.uint8))[1:-1, 1:-1]
+    step = max(2, int(np.sqrt(inside.sum() / max(count, 1))))
+    rows, columns = np.mgrid[step // 2 : inside.shape[0] : step, step // 2 : inside.shape[1] : step]
+    chosen = inside[rows, columns] > 0
+    return rows[chosen], columns[chosen]
+
+
+def _sample(image: np.ndarray, positions_px: np.ndarray, method: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """Image values at positions [h, w, 2] in pixels with centres at + 0.5; outside is 0."""
+    return cv2.remap(
+        image, positions_px[..., 0].astype(np.float32) - 0.5, positions_px[..., 1].astype(np.float32) - 0.5, method
+    )
+
+
+def _lookup(field: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """A field [h, w, 2] interpolated at integer-centred positions [N, 2] -> [N, 2]."""
+    x, y = at[:, :1], at[:, 1:]
+    return np.stack(
+        [cv2.remap(np.ascontiguousarray(field[..., k]), x, y, cv2.INTER_LINEAR)[:, 0] for k in (0, 1)], axis=1
+    )
+
+
+def points_on_grid(grid: SurfaceGrid, where: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """The surface's points [N, 3] at grid places [N, 2] (row, column)."""
+    corners = grid.corners[where[:, 0], where[:, 1]]
+    return interpolate(vertices, corners, np.arange(len(corners)), grid.bary[where[:, 0], where[:, 1]])
