@@ -1,0 +1,117 @@
+"""Camera, light and motion of a clip in USD.
+
+The camera sits in the asset as filmed: lens and film back from the intrinsics, a shifted principal point as
+aperture offsets. UsdGeomCamera counts focal length and apertures in tenths of a scene unit, here tenths of a
+millimetre. Its axes are x right, y up, looking along -z, so it is the OpenCV camera turned half around x. The
+dome light needs no transform: UsdLuxDomeLight's lat-long layout (OpenEXR's: longitude +pi at the left edge, 0
+towards +z, pi/2 towards +x) is the layout of Limn's environment maps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
+
+from shared.geometry import WORLD_FROM_CAMERA, invert_rigid
+
+DEFAULT_FILM_WIDTH_MM = 36.0
+"""Film back assumed where only the focal length in pixels is known; the picture is the same for any."""
+_TENTHS = 10.0
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What was filmed: camera_from_head [F, 4, 4] mm, frame_index [F], intrinsics [3, 3] px of a width x
+    height frame.
+
+    moves: "head" or "camera", what turned while the light stood still. film_width_mm: width of the sensor
+    that the full frame shows.
+    """
+
+    camera_from_head: np.ndarray
+    frame_index: np.ndarray
+    fps: float
+    intrinsics: np.ndarray
+    width: int
+    height: int
+    moves: str
+    film_width_mm: float = DEFAULT_FILM_WIDTH_MM
+
+
+def define_camera(stage: Usd.Stage, path: str, capture: Capture) -> UsdGeom.Camera:
+    """The camera with the clip's lens and film back; animated when it was the camera that moved."""
+    camera = UsdGeom.Camera.Define(stage, path)
+    focal_x, focal_y = capture.intrinsics[0, 0], capture.intrinsics[1, 1]
+    width, height = capture.width, capture.height
+    aperture_x = _TENTHS * capture.film_width_mm
+    focal = aperture_x * focal_x / width
+    aperture_y = focal * height / focal_y
+    camera.CreateProjectionAttr(UsdGeom.Tokens.perspective)
+    camera.CreateFocalLengthAttr(float(focal))
+    camera.CreateHorizontalApertureAttr(float(aperture_x))
+    camera.CreateVerticalApertureAttr(float(aperture_y))
+    # The film window is [offset - aperture / 2, offset + aperture / 2] around the optical axis, y up.
+    camera.CreateHorizontalApertureOffsetAttr(
+        float((width / 2 - capture.intrinsics[0, 2]) * aperture_x / width)
+    )
+    camera.CreateVerticalApertureOffsetAttr(
+        float((capture.intrinsics[1, 2] - height / 2) * aperture_y / height)
+    )
+    distance = float(np.linalg.norm(capture.camera_from_head[:, :3, 3], axis=1).mean())
+    camera.CreateClippingRangeAttr(Gf.Vec2f(distance / 100.0, distance * 100.0))
+    camera.CreateFocusDistanceAttr(distance)
+    camera.CreateFStopAttr(0.0)
+    if capture.moves == "camera":
+        animate(camera, world_from_usd_camera(capture), capture.frame_index)
+    return camera
+
+
+def world_from_usd_camera(capture: Capture) -> np.ndarray:
+    """[F, 4, 4]: from the axes of a USD camera (y up, looking along -z) to the world in which the light
+    stands."""
+    turn = np.diag([*np.diag(WORLD_FROM_CAMERA), 1.0])
+    if capture.moves == "camera":
+        return invert_rigid(capture.camera_from_head) @ turn
+    return np.broadcast_to(np.eye(4), capture.camera_from_head.shape).copy()
+
+
+def world_from_head_rigid(capture: Capture) -> np.ndarray:
+    """[F, 4, 4]: the head's motion in the world in which the light stands still."""
+    turn = np.diag([*np.diag(WORLD_FROM_CAMERA), 1.0])
+    if capture.moves == "camera":
+        return np.broadcast_to(np.eye(4), capture.camera_from_head.shape).copy()
+    return turn @ capture.camera_from_head
+
+
+def animate(prim: UsdGeom.Xformable, world_from_local: np.ndarray, time_codes: np.ndarray) -> None:
+    """Time samples [F, 4, 4] of a rigid motion as translate and orient.
+
+    Quaternions, unlike matrices, stay rotations when a reader interpolates between samples. Neighbours are
+    kept in one hemisphere so that it takes the short way.
+    """
+    translate = prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
+    orient = prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
+    last = Gf.Quatd(1.0)
+    for transform, time in zip(world_from_local, time_codes, strict=True):
+        # Gf matrices act on row vectors.
+        rotation = (
+            Gf.Matrix3d(*(float(value) for value in transform[:3, :3].T.ravel())).ExtractRotation().GetQuat()
+        )
+        if Gf.Dot(rotation, last) < 0.0:
+            rotation = -rotation
+        translate.Set(Gf.Vec3d(*(float(value) for value in transform[:3, 3])), float(time))
+        orient.Set(rotation, float(time))
+        last = rotation
+
+
+def define_dome_light(stage: Usd.Stage, path: str, envmap: str, colour_space: str) -> UsdLux.DomeLight:
+    """The recovered light: a dome with the lat-long map (path relative to the layer), intensity 1, at
+    rest."""
+    light = UsdLux.DomeLight.Define(stage, path)
+    light.CreateIntensityAttr(1.0)
+    light.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
+    texture = light.CreateTextureFileAttr(Sdf.AssetPath(envmap))
+    texture.SetColorSpace(colour_space)
+    return light

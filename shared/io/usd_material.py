@@ -1,0 +1,141 @@
+"""The skin material in USD: UsdPreviewSurface and MaterialX OpenPBR side by side, both fed by the same maps.
+
+Limn's BRDF is albedo / pi + specular_intensity * GGX with Schlick's F0 = 0.04 and alpha = roughness^2.
+OpenPBR takes that as it is: specular_ior 1.5 gives F0 = 0.04, specular_weight scales it, specular_roughness
+squares the same way. UsdPreviewSurface has no specular weight. Its specular workflow (specularColor = F0)
+would say the same, but importers read specularColor as a tint on top of the index of refraction (Blender) or
+ignore it (consumer viewers). OpenPBR defines its weight as a modulated index of refraction, so that index
+itself is written as a map and drives `ior`: every conforming renderer shows the same F0, and one that ignores
+the map falls back to 1.5, intensity 1.
+
+Both models darken the diffuse layer by what the specular layer reflects (4 to 5 % at F0 = 0.04); Limn's BRDF
+does not.
+
+References: UsdPreviewSurface specification 2.6; OpenPBR surface 1.1, section 3.6 (specular weight); MaterialX
+1.39.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdShade
+
+IOR = 1.5
+"""Index of refraction whose F0, ((n - 1) / (n + 1))^2, is the 0.04 of the BRDF."""
+
+# Limn's map -> (UsdPreviewSurface input, OpenPBR input): the one place where the names meet.
+SHADER_INPUTS = {
+    "diffuse_albedo": ("diffuseColor", "base_color"),
+    "specular_intensity": (None, "specular_weight"),
+    "specular_ior": ("ior", None),
+    "roughness": ("roughness", "specular_roughness"),
+    "normal": ("normal", "geometry_normal"),
+}
+COLOUR_MAPS = ("diffuse_albedo",)
+_PREVIEW_TYPES = {
+    "diffuseColor": (Sdf.ValueTypeNames.Color3f, "rgb"),
+    "ior": (Sdf.ValueTypeNames.Float, "r"),
+    "roughness": (Sdf.ValueTypeNames.Float, "r"),
+    "normal": (Sdf.ValueTypeNames.Normal3f, "rgb"),
+}
+_IMAGE_NODES = {
+    "base_color": ("ND_image_color3", Sdf.ValueTypeNames.Color3f, Gf.Vec3f(0.0)),
+    "specular_weight": ("ND_image_float", Sdf.ValueTypeNames.Float, 1.0),
+    "specular_roughness": ("ND_image_float", Sdf.ValueTypeNames.Float, 0.5),
+    "geometry_normal": ("ND_image_vector3", Sdf.ValueTypeNames.Float3, Gf.Vec3f(0.5, 0.5, 1.0)),
+}
+NORMAL_SCALE, NORMAL_BIAS = Gf.Vec4f(2.0, 2.0, 2.0, 1.0), Gf.Vec4f(-1.0, -1.0, -1.0, 0.0)
+"""UsdUVTexture has to undo n * 0.5 + 0.5 by itself; the MaterialX normalmap node does it inside."""
+
+
+def modulated_ior(specular_intensity: np.ndarray) -> np.ndarray:
+    """[...] specular intensity -> [...] index of refraction whose F0 is 0.04 times the intensity.
+
+    OpenPBR 1.1, specular weight: eta' = (1 + e) / (1 - e), e = sqrt(weight) (eta - 1) / (eta + 1).
+    Intensities below zero count as zero; F0 is kept below 1.
+    """
+    root = np.sqrt(np.maximum(specular_intensity, 0.0)) * ((IOR - 1.0) / (IOR + 1.0))
+    root = np.minimum(root, 0.99)
+    return ((1.0 + root) / (1.0 - root)).astype(np.float32)
+
+
+def define_material(
+    stage: Usd.Stage, path: str, maps: Mapping[str, str], colour_space: str
+) -> UsdShade.Material:
+    """Defines the material at path from maps {name of SHADER_INPUTS: file path relative to the layer}.
+
+    colour_space: of the linear colour maps, such as lin_rec709_scene. Maps that are absent leave the input's
+    default.
+    """
+    material = UsdShade.Material.Define(stage, path)
+    _preview_surface(stage, material, maps, colour_space)
+    _open_pbr(stage, material, maps, colour_space)
+    return material
+
+
+def _preview_surface(stage, material, maps, colour_space) -> None:
+    surface = _shader(stage, material, "preview_surface", "UsdPreviewSurface")
+    surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
+    surface.CreateInput("useSpecularWorkflow", Sdf.ValueTypeNames.Int).Set(0)
+    surface.CreateInput("ior", Sdf.ValueTypeNames.Float).Set(IOR)
+    reader = _shader(stage, material, "preview_st", "UsdPrimvarReader_float2")
+    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+    coordinates = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+    for name, (preview_input, _) in SHADER_INPUTS.items():
+        if preview_input is None or name not in maps:
+            continue
+        texture = _shader(stage, material, f"preview_{name}", "UsdUVTexture")
+        texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
+        _file_input(texture, maps[name], colour_space if name in COLOUR_MAPS else "data")
+        texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("raw")
+        for axis in ("wrapS", "wrapT"):
+            texture.CreateInput(axis, Sdf.ValueTypeNames.Token).Set("clamp")
+        if name == "normal":
+            texture.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(NORMAL_SCALE)
+            texture.CreateInput("bias", Sdf.ValueTypeNames.Float4).Set(NORMAL_BIAS)
+        value_type, channel = _PREVIEW_TYPES[preview_input]
+        output_type = Sdf.ValueTypeNames.Float if channel == "r" else Sdf.ValueTypeNames.Float3
+        output = texture.CreateOutput(channel, output_type)
+        surface.CreateInput(preview_input, value_type).ConnectToSource(output)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+
+
+def _open_pbr(stage, material, maps, colour_space) -> None:
+    surface = _shader(stage, material, "openpbr_surface", "ND_open_pbr_surface_surfaceshader")
+    surface.CreateInput("specular_ior", Sdf.ValueTypeNames.Float).Set(IOR)
+    surface.CreateInput("base_diffuse_roughness", Sdf.ValueTypeNames.Float).Set(0.0)
+    reader = _shader(stage, material, "openpbr_st", "ND_geompropvalue_vector2")
+    reader.CreateInput("geomprop", Sdf.ValueTypeNames.String).Set("st")
+    coordinates = reader.CreateOutput("out", Sdf.ValueTypeNames.Float2)
+    for name, (_, open_pbr_input) in SHADER_INPUTS.items():
+        if open_pbr_input is None or name not in maps:
+            continue
+        node, value_type, default = _IMAGE_NODES[open_pbr_input]
+        image = _shader(stage, material, f"openpbr_{name}", node)
+        image.CreateInput("texcoord", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
+        _file_input(image, maps[name], colour_space if name in COLOUR_MAPS else "data")
+        image.CreateInput("default", value_type).Set(default)
+        for axis in ("uaddressmode", "vaddressmode"):
+            image.CreateInput(axis, Sdf.ValueTypeNames.String).Set("clamp")
+        output = image.CreateOutput("out", value_type)
+        if name == "normal":
+            bend = _shader(stage, material, "openpbr_normalmap", "ND_normalmap_float")
+            bend.CreateInput("in", value_type).ConnectToSource(output)
+            output = bend.CreateOutput("out", value_type)
+        surface.CreateInput(open_pbr_input, value_type).ConnectToSource(output)
+    terminal = surface.CreateOutput("out", Sdf.ValueTypeNames.Token)
+    material.CreateSurfaceOutput("mtlx").ConnectToSource(terminal)
+
+
+def _shader(stage: Usd.Stage, material: UsdShade.Material, name: str, shader_id: str) -> UsdShade.Shader:
+    shader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild(name))
+    shader.CreateIdAttr(shader_id)
+    return shader
+
+
+def _file_input(shader: UsdShade.Shader, file: str, colour_space: str) -> None:
+    attribute = shader.CreateInput("file", Sdf.ValueTypeNames.Asset)
+    attribute.Set(Sdf.AssetPath(file))
+    attribute.GetAttr().SetColorSpace(colour_space)

@@ -1,0 +1,135 @@
+"""Checks a written USD asset: usd-core's validators, the MaterialX library, and what both are blind to.
+
+usd-core ships without usdMtlx, so its shader registry knows no MaterialX node and reports each as unknown.
+Those reports are filtered by name and the nodes are checked against the MaterialX package's own definitions
+instead. The validators do not look at index ranges, texture coordinates, or the decoding of a floating-point
+normal map.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import MaterialX as mx
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdValidation
+
+from shared.io.usd_material import NORMAL_BIAS, NORMAL_SCALE
+from shared.mesh import Mesh
+from shared.mesh_checks import mesh_errors
+
+MATERIALX_PREFIX = "ND_"
+_FALSE_ALARM = "MissingShaderIdInRegistry"
+# MaterialX type -> how it is spelled in USD, after usdMtlx's own table.
+_USD_TYPES = {
+    "float": ("float",),
+    "integer": ("int",),
+    "color3": ("color3f",),
+    "vector2": ("float2",),
+    "vector3": ("float3", "vector3f", "normal3f"),
+    "string": ("string",),
+    "filename": ("asset",),
+    "surfaceshader": ("token",),
+}
+
+
+def usd_errors(path: Path | str) -> list[str]:
+    """Sentences about everything wrong with the asset at path (.usda or .usdz); empty when it is sound."""
+    stage = Usd.Stage.Open(str(path))
+    if stage is None or not stage.GetDefaultPrim():
+        return [f"{Path(path).name}: not a USD stage with a default prim"]
+    errors = _validator_errors(stage)
+    for prim in stage.Traverse():
+        if prim.IsA(UsdGeom.Mesh):
+            errors += _mesh_errors(UsdGeom.Mesh(prim))
+        elif prim.IsA(UsdShade.Shader):
+            errors += _shader_errors(UsdShade.Shader(prim))
+        errors += _path_errors(prim)
+    return [f"{Path(path).name}: {error}" for error in errors]
+
+
+def _validator_errors(stage: Usd.Stage) -> list[str]:
+    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+    found = []
+    for error in context.Validate(stage):
+        identifier, message = str(error.GetIdentifier()), error.GetMessage()
+        if identifier.endswith(_FALSE_ALARM) and f"'{MATERIALX_PREFIX}" in message:
+            continue
+        found.append(f"{identifier}: {message}")
+    return sorted(found)
+
+
+def _mesh_errors(prim: UsdGeom.Mesh) -> list[str]:
+    path = prim.GetPath()
+    counts = np.array(prim.GetFaceVertexCountsAttr().Get())
+    indices = np.array(prim.GetFaceVertexIndicesAttr().Get())
+    points = np.array(prim.GetPointsAttr().Get())
+    primvars = UsdGeom.PrimvarsAPI(prim)
+    coordinates, normals = primvars.GetPrimvar("st"), primvars.GetPrimvar("normals")
+    if set(counts) != {3} or len(indices) != 3 * len(counts):
+        return [f"{path}: faces are not all triangles"]
+    errors = []
+    for primvar in (coordinates, normals):
+        if primvar.GetInterpolation() != UsdGeom.Tokens.faceVarying or len(primvar.GetIndices()) != len(
+            indices
+        ):
+            errors.append(f"{primvar.GetAttr().GetPath()}: not one value per face corner")
+    faces, face_uvs = indices.reshape(-1, 3), np.array(coordinates.GetIndices()).reshape(-1, 3)
+    mesh = Mesh(points, faces, np.array(coordinates.Get()), face_uvs)
+    errors += [f"{path}: {error}" for error in mesh_errors(mesh)]
+    lengths = np.linalg.norm(np.array(normals.Get()), axis=1)
+    if np.abs(lengths[np.unique(indices.clip(0, len(lengths) - 1))] - 1.0).max() > 1e-3:
+        errors.append(f"{path}: normals are not unit vectors")
+    extent = np.array(prim.GetExtentAttr().Get())
+    if not np.allclose(extent, [points.min(0), points.max(0)], atol=1e-3):
+        errors.append(f"{path}: extent does not enclose the points")
+    return errors
+
+
+def _path_errors(prim: Usd.Prim) -> list[str]:
+    """Asset paths have to be relative, or the folder cannot be moved."""
+    errors = []
+    for attribute in prim.GetAuthoredAttributes():
+        if attribute.GetTypeName() != Sdf.ValueTypeNames.Asset:
+            continue
+        value = attribute.Get()
+        if value and Path(value.path).is_absolute():
+            errors.append(f"{attribute.GetPath()}: the path {value.path} is not relative")
+    return errors
+
+
+def _shader_errors(shader: UsdShade.Shader) -> list[str]:
+    shader_id = shader.GetShaderId()
+    if shader_id.startswith(MATERIALX_PREFIX):
+        return _materialx_errors(shader, shader_id)
+    if shader_id != "UsdPreviewSurface" or not shader.GetInput("normal").HasConnectedSource():
+        return []
+    texture = UsdShade.Shader(shader.GetInput("normal").GetConnectedSources()[0][0].source.GetPrim())
+    scale, bias = texture.GetInput("scale").Get(), texture.GetInput("bias").Get()
+    if scale != NORMAL_SCALE or bias != NORMAL_BIAS:
+        return [f"{texture.GetPath()}: scale {scale} and bias {bias} do not decode a normal map"]
+    return []
+
+
+@lru_cache(maxsize=1)
+def _materialx_library() -> mx.Document:
+    library = mx.createDocument()
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
+    return library
+
+
+def _materialx_errors(shader: UsdShade.Shader, shader_id: str) -> list[str]:
+    definition = _materialx_library().getNodeDef(shader_id)
+    if definition is None:
+        return [f"{shader.GetPath()}: MaterialX {mx.getVersionString()} knows no node {shader_id}"]
+    errors = []
+    ports = [(port, definition.getActiveInput(port.GetBaseName())) for port in shader.GetInputs()]
+    ports += [(port, definition.getActiveOutput(port.GetBaseName())) for port in shader.GetOutputs()]
+    for port, defined in ports:
+        where, usd_type = port.GetAttr().GetPath(), str(port.GetTypeName())
+        if defined is None:
+            errors.append(f"{where}: {shader_id} has no such port")
+        elif usd_type not in _USD_TYPES.get(defined.getType(), ()):
+            errors.append(f"{where}: type {usd_type}, MaterialX says {defined.getType()}")
+    return errors

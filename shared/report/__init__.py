@@ -1,0 +1,1 @@
+"""The report: one self-contained page on which a person judges a result."""

@@ -1,0 +1,104 @@
+"""From the result's arrays and records to the page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from shared.io.frames import FrameSet
+from shared.io.images import read_png
+from shared.mesh import Mesh
+from shared.report.content import Cost, ReportContent
+from shared.report.gather import chosen_frames, compared_frames, excluded_frames, motion
+from shared.report.page import report_html
+from shared.report.sections import number
+
+
+@dataclass(frozen=True)
+class Result:
+    """What the export holds in memory while it writes: the report's raw material.
+
+    folders {stage: folder} of the stages before it; record: the content of run.json; files: (name, text) pairs.
+    """
+
+    name: str
+    folders: Mapping[str, Path]
+    frames: FrameSet
+    mesh: Mesh
+    poses: Mapping[str, np.ndarray]
+    maps: Mapping[str, np.ndarray]
+    envmap: np.ndarray
+    solve: Mapping[str, object]
+    record: Mapping[str, object]
+    files: Sequence[tuple[str, str]]
+
+
+def result_report(result: Result, frame_count: int) -> str:
+    """The page of one result, comparing at most frame_count frames."""
+    frames, poses, solve, record = result.frames, result.poses, result.solve, result.record
+    tracked, solved = result.folders["track_landmarks"], result.folders["inverse_render"]
+    held_out = solve.get("held_out_frames", [])
+    chosen = chosen_frames(solve["render_frames"], held_out, frame_count)
+    angles, position = motion(poses["camera_from_head"], frames.moves)
+    overlay = tracked / "overlay.png"
+    excluded = excluded_frames(result.folders["sample_frames"], tracked)
+    content = ReportContent(
+        name=result.name,
+        facts=_facts(frames),
+        numbers=_numbers(angles, len(excluded), record),
+        frames=compared_frames(frames, solved / "renders", chosen, held_out),
+        maps=result.maps,
+        envmap=result.envmap,
+        mesh=result.mesh,
+        frame_index=poses["frame_index"],
+        angles_deg=angles,
+        position_mm=position,
+        overlay=read_png(overlay) if overlay.is_file() else None,
+        excluded=excluded,
+        model={**solve.get("model", {}), "albedo_scale": solve.get("albedo_scale")},
+        residuals=solve.get("residuals", {}),
+        iterations=solve.get("iterations", []),
+        costs=[_cost(name, values) for name, values in record["stages"].items()],
+        warnings=[(row["stage"], row["text"]) for row in record["warnings"]],
+        parameters=_parameters(record),
+        files=result.files,
+    )
+    return report_html(content)
+
+
+def _facts(frames: FrameSet) -> list[tuple[str, str]]:
+    width, height = frames.source_size
+    lens = "given" if frames.focal_known else "estimated"
+    mover = {"head": "the head turns", "camera": "the camera moves"}[frames.moves]
+    return [
+        ("clip", frames.source_name),
+        ("size", f"{width} x {height}"),
+        ("at", f"{frames.fps:.4g} frames/s"),
+        (mover + ",", f"colour {frames.transfer}"),
+        ("focal length", f"{frames.intrinsics_source[0, 0]:.0f} px ({lens})"),
+    ]
+
+
+def _numbers(angles: np.ndarray, excluded: int, record: Mapping) -> list[tuple[str, str]]:
+    turn = np.ptp(angles[:, 0])
+    total = sum(values.get("wall_s") or 0.0 for values in record["stages"].values())
+    rows = [("frames used", str(len(angles))), ("frames left out", str(excluded)), ("turn", f"{turn:.0f}\u00b0")]
+    for key, value in record.get("residuals", {}).items():
+        if isinstance(value, (int, float)):
+            rows.append((f"residual, {key.replace('_', ' ')}", number(float(value))))
+    return [*rows, ("seconds, all stages", f"{total:.0f}"), ("warnings", str(len(record["warnings"])))]
+
+
+def _cost(stage: str, values: Mapping) -> Cost:
+    return Cost(stage, values.get("wall_s"), values.get("cpu_s"), values.get("peak_memory_mb"))
+
+
+def _parameters(record: Mapping) -> list[tuple[str, str, object]]:
+    return [
+        (stage, name, value)
+        for stage, values in record["stages"].items()
+        for name, value in values["parameters"].items()
+    ]

@@ -1,0 +1,141 @@
+"use strict";
+// The 3D view: the head under the light of the clip (order-2 harmonics) and one lamp that can be moved.
+// Drag turns the head, or moves the lamp when that is chosen; wheel or pinch zooms.
+function startViewer(canvas, data) {
+  const gl = data && canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
+  if (!gl) {
+    canvas.hidden = true;
+    document.getElementById("viewer-absent").hidden = false;
+    return;
+  }
+  const vertexSource = `
+    attribute vec3 position; attribute vec3 normal; attribute vec2 uv;
+    uniform vec3 low, size, centre; uniform mat3 turn; uniform float zoom, aspect;
+    varying vec3 n, p; varying vec2 st;
+    void main() {
+      p = turn * (low + size * position - centre);
+      n = turn * normal; st = uv;
+      float depth = 3.2 - p.z;
+      vec2 xy = p.xy * zoom * 3.2;
+      gl_Position = vec4(aspect > 1.0 ? xy.x / aspect : xy.x, aspect > 1.0 ? xy.y : xy.y * aspect,
+                         (depth - 3.2) / 2.0 * depth, depth);
+    }`;
+  const fragmentSource = `
+    precision highp float;
+    varying vec3 n, p; varying vec2 st;
+    uniform sampler2D albedo; uniform vec3 harmonics[9], lamp; uniform float clip, power, specular, rough, plain;
+    vec3 toLinear(vec3 c) { return mix(c / 12.92, pow((c + 0.055) / 1.055, vec3(2.4)), step(0.04045, c)); }
+    vec3 toCodes(vec3 c) { return mix(12.92 * c, 1.055 * pow(max(c, 1e-5), vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c)); }
+    void main() {
+      vec3 N = normalize(gl_FrontFacing ? n : -n), V = normalize(vec3(0.0, 0.0, 3.2) - p), L = normalize(lamp);
+      vec3 H = normalize(L + V), m = N;
+      vec3 base = mix(toLinear(texture2D(albedo, st).rgb), vec3(0.5), plain);
+      vec3 sky = harmonics[0] + harmonics[1] * m.y + harmonics[2] * m.z + harmonics[3] * m.x + harmonics[4] * m.x * m.y
+        + harmonics[5] * m.y * m.z + harmonics[6] * (3.0 * m.z * m.z - 1.0) + harmonics[7] * m.x * m.z
+        + harmonics[8] * (m.x * m.x - m.y * m.y);
+      float nl = max(dot(N, L), 0.0), nv = max(dot(N, V), 0.05), nh = dot(N, H), a = rough * rough, a2 = a * a;
+      float d = a2 / (3.14159 * pow(nh * nh * (a2 - 1.0) + 1.0, 2.0));
+      float f = 0.04 + 0.96 * pow(1.0 - max(dot(V, H), 0.0), 5.0), k = a / 2.0;
+      float g = 1.0 / ((nl * (1.0 - k) + k) * (nv * (1.0 - k) + k));
+      vec3 colour = base * max(sky, 0.0) * clip + (base + 3.14159 * specular * d * f * g / 4.0) * nl * power;
+      gl_FragColor = vec4(toCodes(clamp(colour, 0.0, 1.0)), 1.0);
+    }`;
+  const program = gl.createProgram();
+  for (const [kind, source] of [[gl.VERTEX_SHADER, vertexSource], [gl.FRAGMENT_SHADER, fragmentSource]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+    gl.attachShader(program, shader);
+  }
+  gl.linkProgram(program);
+  gl.useProgram(program);
+  const uniform = (name) => gl.getUniformLocation(program, name);
+  const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  function attribute(name, text, size, type, normalised, stride) {
+    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ARRAY_BUFFER, bytes(text), gl.STATIC_DRAW);
+    const place = gl.getAttribLocation(program, name);
+    gl.enableVertexAttribArray(place);
+    gl.vertexAttribPointer(place, size, type, normalised, stride, 0);
+  }
+  const mesh = data.mesh, scale = 2 / Math.max(...mesh.size);
+  attribute("position", mesh.positions, 3, gl.UNSIGNED_SHORT, true, 8);
+  attribute("normal", mesh.normals, 3, gl.BYTE, true, 4);
+  attribute("uv", mesh.uvs, 2, gl.UNSIGNED_SHORT, true, 4);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, bytes(mesh.faces), gl.STATIC_DRAW);
+  gl.uniform3fv(uniform("low"), mesh.low.map((x) => x * scale));
+  gl.uniform3fv(uniform("size"), mesh.size.map((x) => x * scale));
+  gl.uniform3fv(uniform("centre"), mesh.low.map((x, i) => (x + mesh.size[i] / 2) * scale));
+  gl.uniform3fv(uniform("harmonics"), data.harmonics.flat());
+  gl.uniform1f(uniform("specular"), data.specular);
+  gl.uniform1f(uniform("rough"), data.roughness);
+  gl.enable(gl.DEPTH_TEST);
+
+  const state = { yaw: 0.35, pitch: 0.05, lampYaw: -0.9, lampPitch: 0.5, zoom: 0.95, ready: false };
+  const control = (id) => document.getElementById(id);
+  const rotation = (yaw, pitch) => {  // column-major: first about y, then about x
+    const [c, s, d, t] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
+    return [c, t * s, -d * s, 0, d, t, s, -t * c, d * c];
+  };
+  function draw() {
+    const ratio = window.devicePixelRatio || 1;
+    canvas.width = canvas.clientWidth * ratio;
+    canvas.height = canvas.clientHeight * ratio;
+    gl.viewport(0, 0, canvas.width, canvas.height);
+    gl.clearColor(0.2, 0.2, 0.2, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    if (!state.ready) return;
+    gl.uniformMatrix3fv(uniform("turn"), false, rotation(state.yaw, state.pitch));
+    gl.uniform1f(uniform("zoom"), state.zoom);
+    gl.uniform1f(uniform("aspect"), canvas.width / canvas.height);
+    gl.uniform3f(uniform("lamp"), Math.sin(state.lampYaw) * Math.cos(state.lampPitch),
+      Math.sin(state.lampPitch), Math.cos(state.lampYaw) * Math.cos(state.lampPitch));
+    gl.uniform1f(uniform("clip"), +control("viewer-clip").value);
+    gl.uniform1f(uniform("power"), +control("viewer-lamp").value);
+    gl.uniform1f(uniform("plain"), control("viewer-plain").checked ? 1 : 0);
+    gl.drawElements(gl.TRIANGLES, mesh.count, gl.UNSIGNED_INT, 0);
+    canvas.dataset.drawn = "yes";
+  }
+  const image = new Image();
+  image.onload = () => {
+    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+    gl.pixelStorei(gl.UNPACK_FLIP_Y_WEBGL, true);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, gl.RGB, gl.UNSIGNED_BYTE, image);
+    gl.generateMipmap(gl.TEXTURE_2D);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+    state.ready = true;
+    draw();
+  };
+  image.src = data.albedo;
+  const limit = (x, reach) => Math.max(-reach, Math.min(reach, x));
+  const pointers = new Map();
+  canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); pointers.set(e.pointerId, e); });
+  for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (e) => pointers.delete(e.pointerId));
+  canvas.addEventListener("pointermove", (e) => {
+    const last = pointers.get(e.pointerId);
+    if (!last) return;
+    if (pointers.size === 2) {
+      const other = [...pointers.values()].find((q) => q.pointerId !== e.pointerId);
+      const span = (q) => Math.hypot(q.clientX - other.clientX, q.clientY - other.clientY) || 1;
+      zoomBy(span(e) / span(last));
+    } else {
+      const dx = (e.clientX - last.clientX) / 150, dy = (e.clientY - last.clientY) / 150;
+      if (control("viewer-moves-lamp").checked) {
+        state.lampYaw += dx;
+        state.lampPitch = limit(state.lampPitch - dy, 1.5);
+      } else {
+        state.yaw += dx;
+        state.pitch = limit(state.pitch + dy, 1.5);
+      }
+    }
+    pointers.set(e.pointerId, e);
+    draw();
+  });
+  const zoomBy = (factor) => { state.zoom = Math.max(0.5, Math.min(6, state.zoom * factor)); draw(); };
+  canvas.addEventListener("wheel", (e) => { e.preventDefault(); zoomBy(Math.exp(-e.deltaY / 500)); }, { passive: false });
+  for (const id of ["viewer-clip", "viewer-lamp", "viewer-plain"]) control(id).addEventListener("input", draw);
+  window.addEventListener("resize", draw);
+  draw();
+}

@@ -1,0 +1,92 @@
+"""The mesh for the page's 3D view: reduced, quantised and packed into base64 text; light as order-2 harmonics.
+
+References: Ramamoorthi and Hanrahan, An efficient representation for irradiance environment maps, 2001.
+"""
+
+from __future__ import annotations
+
+import base64
+
+import numpy as np
+
+from shared.mesh import Mesh
+
+FACE_LIMIT = 40_000
+"""About 700 kB on the page; the eye sees no difference at its size."""
+
+
+def coarser(mesh: Mesh) -> Mesh | None:
+    """The mesh before its last subdivision, or None when it is none: F / 4 faces over the same vertices and UVs.
+
+    shared.mesh keeps the four children of a face together, three at its corners and one in the middle.
+    """
+    faces, face_uvs = _parents(mesh.faces), _parents(mesh.face_uvs)
+    return None if faces is None or face_uvs is None else mesh.replace(faces=faces, face_uvs=face_uvs)
+
+
+def _parents(faces: np.ndarray) -> np.ndarray | None:
+    if len(faces) % 4:
+        return None
+    at_a, at_b, at_c, middle = faces.reshape(-1, 4, 3).transpose(1, 0, 2)
+    edges = (at_a[:, 1], at_b[:, 2], at_c[:, 0])
+    others = (at_b[:, 0], at_c[:, 1], at_a[:, 2])
+    joined = all((one == other).all() for one, other in zip(edges, others, strict=True))
+    if not joined or not (middle == np.stack(edges, axis=1)).all():
+        return None
+    return np.stack([at_a[:, 0], at_b[:, 1], at_c[:, 2]], axis=1)
+
+
+def reduced(mesh: Mesh, face_limit: int = FACE_LIMIT) -> Mesh | None:
+    """The mesh with as many subdivisions taken back as the limit asks for; None when that does not suffice."""
+    current: Mesh | None = mesh
+    while current is not None and len(current.faces) > face_limit:
+        current = coarser(current)
+    return current
+
+
+def packed(mesh: Mesh, normals: np.ndarray) -> dict:
+    """For viewer.js: one vertex per distinct corner, positions and UVs as uint16, normals as int8, base64.
+
+    normals [V, 3], such as those of the mesh before it was reduced. -> {"count", "positions", "normals", "uvs",
+    "faces", "low" [3], "size" [3]}; position = low + size * q / 65535 mm.
+    """
+    uv_codes = np.round(np.clip(mesh.uvs, 0.0, 1.0) * 65535).astype(np.int64)
+    keys = np.column_stack([mesh.faces.ravel(), uv_codes[mesh.face_uvs.ravel()]])
+    corners, index = np.unique(keys, axis=0, return_inverse=True)
+    used = corners[:, 0]
+    low, high = mesh.vertices[used].min(0), mesh.vertices[used].max(0)
+    size = np.maximum(high - low, 1e-9)
+    positions, padded = np.zeros((len(corners), 4), "<u2"), np.zeros((len(corners), 4), np.int8)
+    positions[:, :3] = np.round((mesh.vertices[used] - low) / size * 65535)
+    padded[:, :3] = np.round(normals[used] * 127)
+    return {
+        "count": int(index.size),
+        "positions": _text(positions),
+        "normals": _text(padded),
+        "uvs": _text(corners[:, 1:].astype("<u2")),
+        "faces": _text(index.ravel().astype("<u4")),
+        "low": [round(float(value), 4) for value in low],
+        "size": [round(float(value), 4) for value in size],
+    }
+
+
+def _text(array: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
+
+
+def irradiance_harmonics(envmap: np.ndarray) -> np.ndarray:
+    """[H, W, 3] lat-long radiance -> [9, 3] such that sum_k c_k Y_k(n) is irradiance / pi for the normal n.
+
+    Y_k as polynomials 1, y, z, x, xy, yz, 3z^2-1, xz, x^2-y^2 with their constants folded into c (Ramamoorthi and
+    Hanrahan 2001, eqs. 3 and 8: the clamped cosine weighs the orders by pi, 2 pi / 3, pi / 4).
+    """
+    height, width = envmap.shape[:2]
+    v, u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
+    ring = np.sin(np.pi * v)
+    x, y, z = np.sin(2 * np.pi * u) * ring, np.cos(np.pi * v), -np.cos(2 * np.pi * u) * ring
+    basis = np.stack([np.ones_like(x), y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y], axis=-1)
+    constants = np.array([0.282095, *[0.488603] * 3, 1.092548, 1.092548, 0.315392, 1.092548, 0.546274])
+    cosine = np.array([1.0, *[2 / 3] * 3, *[0.25] * 5])
+    solid_angle = ring * (2 * np.pi / width) * (np.pi / height)
+    moments = np.einsum("hw,hwk,hwc->kc", solid_angle, basis, envmap)
+    return moments * (constants**2 * cosine)[:, None]

@@ -1,0 +1,420 @@
+"""The exported files, read back by USD, OpenEXR and zip as another program would."""
+
+import os
+import zipfile
+
+import numpy as np
+import OpenEXR
+import pytest
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
+from toy_result import (
+    CROP,
+    FRAMES,
+    INTRINSICS,
+    MAP_SIZE,
+    RENDERED,
+    SOURCE_SIZE,
+    ToyJob,
+    toy_maps,
+    toy_mesh,
+    toy_poses,
+    write_toy_work,
+)
+
+from shared.errors import LimnError
+from shared.geometry import project, world_from_head
+from shared.io.arrays import load_arrays, read_json
+from shared.io.export_maps import acescg_from_rec709, paste_crop
+from shared.io.images import read_exr, read_png, write_exr
+from shared.io.meshes import read_obj
+from shared.io.usd import VARIANT_SET, VARIANT_STILL, prim_name
+from shared.io.usd_capture import Capture
+from shared.io.usd_material import modulated_ior
+from shared.io.usd_validate import usd_errors
+from shared.io.usdz import write_usdz
+from shared.mesh import Mesh, vertex_normals
+from shared.mesh_checks import mesh_errors, mesh_warnings
+from stages import export_usd
+
+NAME = '1st "Zoë" <take> / été'
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """The folders of the stages before, once with a turning head and once with a moving camera."""
+    base = tmp_path_factory.mktemp("toy")
+    return {moves: write_toy_work(base / moves, moves) for moves in ("head", "camera")}
+
+
+@pytest.fixture(scope="module")
+def exported(work, tmp_path_factory):
+    """{moves: published folder}, both exported under a difficult name."""
+    folders = {}
+    for moves, folder in work.items():
+        job = ToyJob(folder, tmp_path_factory.mktemp(moves) / "export", NAME)
+        export_usd.run(job)
+        export_usd.check(job)
+        folders[moves] = job.out
+    return folders
+
+
+@pytest.fixture
+def stage(exported):
+    """The exported layer of the turning head, opened."""
+    return Usd.Stage.Open(str(exported["head"] / "head.usda"))
+
+
+def shader(stage, name):
+    """A shader of the one material."""
+    return UsdShade.Shader(stage.GetDefaultPrim().GetPrimAtPath(f"mtl/skin/{name}"))
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("anna", "anna"),
+        ("Zoë's  2nd take", "Zoe_s_2nd_take"),
+        ("7up", "_7up"),
+        ('a"b<c>/d\\e', "a_b_c_d_e"),
+        ("été", "ete"),
+        ("李", "head"),
+        ("", "head"),
+        ("../..", "head"),
+    ],
+)
+def test_prim_name_is_valid_and_readable(name, expected):
+    assert prim_name(name) == expected
+    assert Sdf.Path.IsValidIdentifier(prim_name(name))
+
+
+def test_every_file_of_the_contract_is_there(exported):
+    files = {path.relative_to(exported["head"]).as_posix() for path in exported["head"].rglob("*") if path.is_file()}
+    maps = {f"maps/{name}.exr" for name in (*toy_maps(), "specular_ior")}
+    renders = {f"renders/{frame:04d}.exr" for frame in RENDERED}
+    single = {"head.usda", "head.usdz", "mesh.obj", "envmap.exr", "poses.npz", "run.json", "report.html"}
+    assert files == maps | renders | single
+    assert all(export_usd.STAGE.output_of(file) for file in files)
+
+
+def test_layer_says_what_studios_ask_for(stage):
+    root = stage.GetDefaultPrim()
+    assert root.GetName() == "_1st_Zoe_take_ete" and root.GetDisplayName() == NAME
+    assert Usd.ModelAPI(root).GetKind() == "component"
+    assert Usd.ModelAPI(root).GetAssetInfo()["identifier"].path == "./head.usda"
+    assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 0.001
+    assert stage.GetTimeCodesPerSecond() == 25.0
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (FRAMES[0], FRAMES[-1])
+    assert root.GetPrimAtPath("geo").IsA(UsdGeom.Scope) and root.GetPrimAtPath("mtl").IsA(UsdGeom.Scope)
+    facts = root.GetCustomDataByKey("limn")
+    assert facts["subject"] == NAME and facts["clip"]["name"] == 'a "clip".mp4'
+
+
+def test_mesh_reads_back(stage):
+    mesh, prim = toy_mesh(), UsdGeom.Mesh(stage.GetDefaultPrim().GetPrimAtPath("geo/head"))
+    np.testing.assert_array_equal(np.array(prim.GetPointsAttr().Get()), mesh.vertices.astype(np.float32))
+    np.testing.assert_array_equal(np.array(prim.GetFaceVertexIndicesAttr().Get()), mesh.faces.ravel())
+    assert prim.GetSubdivisionSchemeAttr().Get() == "none"
+    primvars = UsdGeom.PrimvarsAPI(prim)
+    uvs, normals = primvars.GetPrimvar("st"), primvars.GetPrimvar("normals")
+    assert uvs.GetInterpolation() == normals.GetInterpolation() == "faceVarying"
+    np.testing.assert_allclose(np.array(uvs.ComputeFlattened()), mesh.uvs[mesh.face_uvs].reshape(-1, 2), atol=1e-7)
+    smooth = vertex_normals(mesh.vertices, mesh.faces)[mesh.faces].reshape(-1, 3)
+    np.testing.assert_allclose(np.array(normals.ComputeFlattened()), smooth, atol=1e-6)
+    bounds = UsdGeom.Boundable(prim).GetExtentAttr().Get()
+    np.testing.assert_allclose(np.array(bounds), [mesh.vertices.min(0), mesh.vertices.max(0)], atol=1e-4)
+
+
+@pytest.mark.parametrize("moves", ["head", "camera"])
+def test_camera_sees_what_the_clip_saw(exported, moves):
+    """USD's own camera mathematics puts every vertex on the pixel that the poses and intrinsics give."""
+    stage = Usd.Stage.Open(str(exported[moves] / "head.usda"))
+    root, points = stage.GetDefaultPrim(), toy_mesh().vertices[::7]
+    camera, mesh = UsdGeom.Camera(root.GetPrimAtPath("capture/camera")), UsdGeom.Mesh(root.GetPrimAtPath("geo/head"))
+    for frame, pose in zip(FRAMES, toy_poses(), strict=True):
+        frustum = camera.GetCamera(float(frame)).frustum
+        world_from_head = UsdGeom.Imageable(mesh).ComputeLocalToWorldTransform(float(frame))
+        clip_from_head = world_from_head * frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
+        seen = np.array([clip_from_head.Transform(Gf.Vec3d(*point)) for point in points.tolist()])
+        pixels = (seen[:, :2] * [0.5, -0.5] + 0.5) * SOURCE_SIZE
+        np.testing.assert_allclose(pixels, project(points, pose, INTRINSICS)[0], atol=1e-3)
+
+
+def test_lens_in_tenths_of_a_millimetre(stage):
+    camera = UsdGeom.Camera(stage.GetDefaultPrim().GetPrimAtPath("capture/camera"))
+    assert camera.GetHorizontalApertureAttr().Get() == pytest.approx(223.0)
+    focal_mm = INTRINSICS[0, 0] * 22.3 / SOURCE_SIZE[0]
+    assert camera.GetFocalLengthAttr().Get() == pytest.approx(10.0 * focal_mm)
+
+
+@pytest.mark.parametrize("moves", ["head", "camera"])
+def test_light_stands_still_while_the_head_turns(exported, moves):
+    stage = Usd.Stage.Open(str(exported[moves] / "head.usda"))
+    light = UsdLux.DomeLight(stage.GetDefaultPrim().GetPrimAtPath("capture/light"))
+    mesh = UsdGeom.Imageable(stage.GetDefaultPrim().GetPrimAtPath("geo/head"))
+    assert light.GetTextureFormatAttr().Get() == "latlong" and light.GetIntensityAttr().Get() == 1.0
+    assert light.GetTextureFileAttr().Get().path == "./envmap.exr"
+    for frame, expected in zip(FRAMES, world_from_head(toy_poses(), moves), strict=True):
+        assert light.ComputeLocalToWorldTransform(float(frame)) == Gf.Matrix4d(1.0)
+        turned = np.array(mesh.ComputeLocalToWorldTransform(float(frame))).T[:3, :3]
+        np.testing.assert_allclose(turned, expected, atol=1e-12)
+
+
+def test_dome_light_layout_is_that_of_the_environment_map():
+    """OpenEXR: longitude +pi at the left edge; longitude 0 is +z, pi/2 is +x; latitude pi/2 (+y) on top."""
+    u, v = np.random.default_rng(0).uniform(size=(2, 100))
+    longitude, latitude = np.pi - 2 * np.pi * u, np.pi / 2 - np.pi * v
+    across = np.cos(latitude)
+    open_exr = np.stack([np.sin(longitude) * across, np.sin(latitude), np.cos(longitude) * across])
+    ring = np.sin(np.pi * v)
+    ours = np.stack([np.sin(2 * np.pi * u) * ring, np.cos(np.pi * v), -np.cos(2 * np.pi * u) * ring])
+    np.testing.assert_allclose(ours, open_exr, atol=1e-12)
+
+
+def test_motion_between_samples_stays_rigid(stage):
+    mesh = UsdGeom.Imageable(stage.GetDefaultPrim().GetPrimAtPath("geo/head"))
+    for time in np.linspace(FRAMES[0], FRAMES[-1], 23):
+        rotation = np.array(mesh.ComputeLocalToWorldTransform(float(time)))[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+
+
+def test_still_variant_is_the_head_alone(stage):
+    root = stage.GetDefaultPrim()
+    root.GetVariantSets().SetSelection(VARIANT_SET, VARIANT_STILL)
+    assert not root.GetPrimAtPath("capture")
+    mesh = UsdGeom.Imageable(root.GetPrimAtPath("geo/head"))
+    assert mesh.ComputeLocalToWorldTransform(float(FRAMES[-1])) == Gf.Matrix4d(1.0)
+
+
+def test_material_reads_the_maps(stage):
+    material = UsdShade.MaterialBindingAPI(stage.GetDefaultPrim().GetPrimAtPath("geo/head")).ComputeBoundMaterial()[0]
+    assert material.ComputeSurfaceSource()[0].GetShaderId() == "UsdPreviewSurface"
+    assert material.ComputeSurfaceSource("mtlx")[0].GetShaderId() == "ND_open_pbr_surface_surfaceshader"
+    for name in ("diffuse_albedo", "specular_ior", "roughness", "normal"):
+        texture = shader(stage, f"preview_{name}")
+        assert texture.GetInput("file").Get().path == f"./maps/{name}.exr"
+        assert texture.GetInput("sourceColorSpace").Get() == "raw"
+    assert shader(stage, "preview_normal").GetInput("scale").Get() == Gf.Vec4f(2, 2, 2, 1)
+    assert shader(stage, "preview_normal").GetInput("bias").Get() == Gf.Vec4f(-1, -1, -1, 0)
+    spaces = {name: shader(stage, f"openpbr_{name}").GetInput("file").GetAttr().GetColorSpace() for name in
+              ("diffuse_albedo", "specular_intensity", "roughness", "normal")}
+    assert spaces.pop("diffuse_albedo") == "lin_rec709_scene" and set(spaces.values()) == {"data"}
+
+
+def test_both_materials_reflect_alike(stage, exported):
+    """F0 is 0.04 times the specular intensity in either: OpenPBR by its weight, the preview by its index map."""
+    surface = shader(stage, "openpbr_surface")
+    ior = surface.GetInput("specular_ior").Get()
+    assert ((ior - 1) / (ior + 1)) ** 2 == pytest.approx(0.04)
+    intensity = np.array([0.0, 0.3, 1.0, 2.0])
+    index = modulated_ior(intensity)
+    np.testing.assert_allclose(((index - 1) / (index + 1)) ** 2, 0.04 * intensity, rtol=1e-5, atol=1e-12)
+    written = read_exr(exported["head"] / "maps" / "specular_ior.exr")
+    np.testing.assert_allclose(written, modulated_ior(toy_maps()["specular_intensity"]), atol=1e-3)
+
+
+def test_asset_passes_all_validators(exported):
+    for folder in exported.values():
+        assert usd_errors(folder / "head.usda") == []
+        assert usd_errors(folder / "head.usdz") == []
+
+
+def break_index(stage):
+    attribute = UsdGeom.Mesh(stage.GetDefaultPrim().GetPrimAtPath("geo/head")).GetFaceVertexIndicesAttr()
+    indices = list(attribute.Get())
+    indices[4] = 99999
+    attribute.Set(indices)
+
+
+def break_normal_map(stage):
+    shader(stage, "preview_normal").GetPrim().RemoveProperty("inputs:scale")
+
+
+def break_node(stage):
+    shader(stage, "openpbr_roughness").CreateIdAttr("ND_image_flaot")
+
+
+def break_port(stage):
+    shader(stage, "openpbr_surface").CreateInput("specular_wieght", Sdf.ValueTypeNames.Float)
+
+
+def break_path(stage):
+    shader(stage, "preview_roughness").GetInput("file").Set(Sdf.AssetPath(os.path.abspath("roughness.exr")))
+
+
+def break_units(stage):
+    stage.ClearMetadata("metersPerUnit")
+
+
+def break_uvs(stage):
+    primvar = UsdGeom.PrimvarsAPI(stage.GetDefaultPrim().GetPrimAtPath("geo/head")).GetPrimvar("st")
+    primvar.Set([uv * 1.5 for uv in primvar.Get()])
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (break_index, "point outside of their array"),
+        (break_normal_map, "do not decode a normal map"),
+        (break_node, "knows no node ND_image_flaot"),
+        (break_port, "no such port"),
+        (break_path, "is not relative"),
+        (break_units, "metersPerUnit"),
+        (break_uvs, "leave the unit square"),
+    ],
+)
+def test_damaged_assets_are_told(exported, tmp_path, damage, words):
+    stage = Usd.Stage.Open(str(exported["head"] / "head.usda"), Usd.Stage.LoadAll)
+    damage(stage)
+    for name in ("maps", "envmap.exr"):
+        (tmp_path / name).symlink_to(exported["head"] / name)
+    stage.GetRootLayer().Export(str(tmp_path / "head.usda"))
+    stage.Reload()
+    assert any(words in error for error in usd_errors(tmp_path / "head.usda"))
+
+
+def test_usdz_is_stored_aligned_and_repeatable(exported, tmp_path):
+    package, again = exported["head"] / "head.usdz", tmp_path / "again.usdz"
+    os.utime(exported["head"] / "envmap.exr", (1, 1_000_000_000))
+    write_usdz(again, exported["head"] / "head.usda")
+    assert package.read_bytes() == again.read_bytes()
+    with zipfile.ZipFile(package) as archive:
+        members = archive.infolist()
+        assert members[0].filename == "head.usda"
+        used = {f"maps/{name}.exr" for name in (*toy_maps(), "specular_ior")} - {"maps/confidence.exr"}
+        assert {member.filename for member in members[1:]} == used | {"envmap.exr"}
+        for member in members:
+            assert member.compress_type == zipfile.ZIP_STORED
+            content = archive.read(member)
+            assert package.read_bytes().index(content) % 64 == 0
+    stage = Usd.Stage.Open(str(package))
+    assert stage.GetDefaultPrim().GetPrimAtPath("geo/head").IsA(UsdGeom.Mesh)
+
+
+def test_usdz_refuses_a_missing_texture(exported, tmp_path):
+    (tmp_path / "head.usda").write_bytes((exported["head"] / "head.usda").read_bytes())
+    with pytest.raises(LimnError, match="missing"):
+        write_usdz(tmp_path / "head.usdz", tmp_path / "head.usda")
+
+
+def test_maps_keep_values_and_say_what_they_are(exported):
+    for name, values in toy_maps().items():
+        path = exported["head"] / "maps" / f"{name}.exr"
+        np.testing.assert_allclose(read_exr(path), values, rtol=1e-3)
+        with OpenEXR.File(str(path)) as file:  # closing it empties the header
+            header, channel = dict(file.header()), next(iter(file.channels().values()))
+        assert channel.pixels.dtype == np.float16
+        assert header["colorInteropID"] == ("lin_rec709_scene" if name == "diffuse_albedo" else "data")
+        assert header["limn:stage"] == "export_usd" and header["limn:stage_version"] == export_usd.STAGE.version
+        assert header["limn:unit"]
+    with OpenEXR.File(str(exported["head"] / "envmap.exr")) as file:
+        assert file.header()["envmap"] == OpenEXR.ENVMAP_LATLONG
+
+
+def test_half_floats_are_clamped_not_infinite(tmp_path):
+    write_exr(tmp_path / "sun.exr", np.full((2, 4, 3), 1e6), colour_space="lin_rec709_scene", half=True)
+    np.testing.assert_array_equal(read_exr(tmp_path / "sun.exr"), 65504.0)
+
+
+def test_choices_of_format(work, tmp_path):
+    options = {"map_format": "float", "acescg": True, "png_copies": "16", "usdz": False}
+    job = ToyJob(work["head"], tmp_path / "export", **options)
+    export_usd.run(job)
+    export_usd.check(job)
+    assert not (job.out / "head.usdz").exists()
+    albedo = toy_maps()["diffuse_albedo"]
+    np.testing.assert_allclose(read_exr(job.out / "maps" / "diffuse_albedo.exr"), acescg_from_rec709(albedo), atol=1e-6)
+    np.testing.assert_array_equal(read_exr(job.out / "maps" / "roughness.exr"), toy_maps()["roughness"])
+    with OpenEXR.File(str(job.out / "maps" / "diffuse_albedo.exr")) as file:
+        assert file.header()["colorInteropID"] == "lin_ap1_scene"
+    stage = Usd.Stage.Open(str(job.out / "head.usda"))
+    assert shader(stage, "preview_diffuse_albedo").GetInput("file").GetAttr().GetColorSpace() == "lin_ap1_scene"
+    copy = read_png(job.out / "maps" / "png" / "confidence.png")
+    assert copy.dtype == np.uint16
+    np.testing.assert_allclose(copy / 65535.0, toy_maps()["confidence"], atol=1e-5)
+
+
+def test_acescg_matrix():
+    """Rows of the matrix in the ACEScg documents (Rec.709 D65 to AP1 D60, Bradford); grey stays grey."""
+    published = [[0.613097, 0.339523, 0.047379], [0.070194, 0.916354, 0.013452], [0.020616, 0.109570, 0.869815]]
+    np.testing.assert_allclose(acescg_from_rec709(np.eye(3)).T, published, atol=2e-5)
+    np.testing.assert_allclose(acescg_from_rec709(np.full(3, 0.18)), 0.18, atol=2e-5)
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.8, 1.0, 2.0, 3.0])
+def test_pasted_crop_lies_where_it_was_cut(scale):
+    """A picture that is linear in source coordinates comes back as that function, whatever the crop's scale."""
+    x0, y0, width, height = 12.0, 7.5, 60, 50
+    columns, rows = np.meshgrid(np.arange(round(width * scale)) + 0.5, np.arange(round(height * scale)) + 0.5)
+    source_u, source_v = columns / scale + x0, rows / scale + y0
+    crop = np.stack([source_u, source_v, source_u + source_v], axis=-1)
+    full = paste_crop(crop, (x0, y0, scale), (100, 80))
+    u, v = np.meshgrid(np.arange(100) + 0.5, np.arange(80) + 0.5)
+    inside = (u > x0 + 4) & (u < x0 + width - 4) & (v > y0 + 4) & (v < y0 + height - 4)
+    np.testing.assert_allclose(full[inside], np.stack([u, v, u + v], axis=-1)[inside], atol=1e-3)
+    assert full.shape == (80, 100, 3) and np.abs(full[:, :10]).max() == 0.0
+
+
+def test_renders_fill_the_source_frame(exported):
+    render = read_exr(exported["head"] / "renders" / f"{RENDERED[1]:04d}.exr")
+    assert render.shape == (SOURCE_SIZE[1], SOURCE_SIZE[0], 3)
+    x0, y0, scale = CROP
+    rows, columns = np.nonzero(render[..., 0] > 0.2)
+    edges = [columns.min(), columns.max() + 1, rows.min(), rows.max() + 1]
+    np.testing.assert_allclose(edges, [20 / scale + x0, 70 / scale + x0, 20 / scale + y0, 60 / scale + y0], atol=1.0)
+
+
+def test_obj_and_poses_read_back(exported):
+    mesh, back = toy_mesh(), read_obj(exported["head"] / "mesh.obj")
+    np.testing.assert_allclose(back.vertices, mesh.vertices, atol=1e-4)
+    np.testing.assert_allclose(back.uvs, mesh.uvs, atol=1e-6)
+    np.testing.assert_array_equal(back.faces, mesh.faces)
+    poses = load_arrays(exported["head"] / "poses.npz")
+    np.testing.assert_array_equal(poses["camera_from_head"], toy_poses())
+    np.testing.assert_array_equal(poses["frame_index"], FRAMES)
+    np.testing.assert_array_equal(poses["intrinsics"], INTRINSICS)
+
+
+def test_run_record(exported):
+    record = read_json(exported["head"] / "run.json")
+    assert record["subject"] == NAME and set(record["stages"]) == {*export_usd.STAGE.inputs, "export_usd"}
+    assert record["stages"]["inverse_render"]["wall_s"] == 1.5
+    assert record["stages"]["sample_frames"]["parameters"] == {"size": 64}
+    assert record["residuals"] == {"fitted": 0.021, "held_out": 0.023}
+    assert {"stage": "sample_frames", "text": "the focal length is not given"} in record["warnings"]
+
+
+def test_same_input_same_bytes(exported, work, tmp_path):
+    job = ToyJob(work["head"], tmp_path / "export", NAME)
+    export_usd.run(job)
+    for path in sorted(job.out.rglob("*")):
+        name = path.relative_to(job.out).as_posix()
+        if path.is_file() and not export_usd.STAGE.output_of(name).volatile:
+            assert path.read_bytes() == (exported["head"] / name).read_bytes(), name
+
+
+def test_check_refuses_what_no_one_could_use(exported, work, tmp_path):
+    job = ToyJob(work["head"], tmp_path / "export")
+    export_usd.run(job)
+    write_exr(job.out / "maps" / "roughness.exr", np.full((12, 12), 1.5), colour_space="data")
+    with pytest.raises(LimnError, match="roughness: 12 x 12 is not a square power of two.*values up to 1.5"):
+        export_usd.check(job)
+    assert MAP_SIZE & (MAP_SIZE - 1) == 0
+
+
+def test_mesh_errors_and_warnings():
+    mesh = toy_mesh()
+    assert mesh_errors(mesh) == [] and mesh_warnings(mesh) == []
+    assert "point outside" in mesh_errors(mesh.replace(faces=mesh.faces + 1))[0]
+    assert "not finite" in mesh_errors(mesh.replace(vertices=mesh.vertices * np.nan))[0]
+    assert "unit square" in mesh_errors(mesh.replace(uvs=mesh.uvs - 0.5))[0]
+    assert "have no area" in mesh_errors(mesh.replace(vertices=mesh.vertices * [1.0, 0.0, 0.0]))[0]
+    tripled = Mesh(mesh.vertices, np.repeat(mesh.faces, 3, axis=0), mesh.uvs, np.repeat(mesh.face_uvs, 3, axis=0))
+    assert "more than two faces" in mesh_warnings(tripled)[0]
+    turned = mesh.faces.copy()
+    turned[0] = turned[0, ::-1]
+    assert mesh_warnings(mesh.replace(faces=turned)) == ["3 edges join faces of opposite winding"]
+
+
+def test_capture_without_a_lens_assumes_full_frame():
+    capture = Capture(toy_poses(), FRAMES, 25.0, INTRINSICS, *SOURCE_SIZE, "head")
+    assert capture.film_width_mm == 36.0
