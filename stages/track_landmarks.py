@@ -33,7 +33,7 @@ STAGE = Stage(
         Parameter("warp_width", float, 480.0, "Width of the face in the flow's pictures.", "px", 100.0, 2000.0),
         Parameter("loss_scale", float, 0.2, "Residual beyond which a track loses its pull.", "px", 0.01, 10.0),
         Parameter("point_prior", float, 5.0, "Deviation of track points about the fitted head.", "mm", 0.01, 1000.0),
-        Parameter("stiffness", float, 30.0, "Resistance of the free shape correction to bending.", "", 0.01, 1e6),
+        Parameter("stiffness", float, 8.0, "Resistance of the free shape correction to bending.", "", 0.01, 1e6),
         Parameter("least_presence", float, 0.5, "Landmark network's confidence below which a frame is lost.", "", 0, 1),
         Parameter("largest_error", float, 1.5, "Median track error beyond which a frame is excluded.", "px", 0.1, 50.0),
     ),
@@ -44,9 +44,9 @@ SMALL_ROTATION_DEG = 15.0
 
 def read_landmarks(job: Job, frames) -> tuple[np.ndarray, np.ndarray]:
     """All frames through the networks -> landmarks [F, 468, 2] px and presence [F]."""
-    from shared.io.models import load_networks
+    from shared.io.models import load_face_networks
 
-    networks, previous = load_networks(), None
+    networks, previous = load_face_networks(), None
     points, presence = np.zeros((frames.count, 468, 2)), np.zeros(frames.count)
     for i in job.progress(range(frames.count), "landmarks"):
         rgb = eight_bit(frames.read_codes(i))
@@ -153,6 +153,7 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
     from shared.io.meshes import save_mesh
     from shared.mesh import Mesh
     from shared.overlay import overlay_strip
+    from shared.solve.track_head import choose_references
 
     fits, excluded = judge_frames(job, frames, used, presence, track)
     kept = used[fits]
@@ -175,7 +176,7 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
     residual = np.nanmedian(track.error_px[fits], axis=0)
     save_arrays(job.out / "tracks.npz", points_head=track.points_head, residual_px=residual)
     write_json(job.out / "tracking.json", summarise(job, frames, model, track, fits, excluded))
-    shown = kept[np.unique(np.linspace(0, len(kept) - 1, 5).astype(int))]
+    shown = kept[choose_references(track.camera_from_head[fits], 5)]
     pictures = [eight_bit(frames.read_codes(i)) for i in shown]
     poses = [track.camera_from_head[np.nonzero(used == i)[0][0]] for i in shown]
     write_png(job.out / "overlay.png", overlay_strip(pictures, mesh, poses, frames.intrinsics, landmarks_px[shown]))

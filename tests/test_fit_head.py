@@ -11,6 +11,7 @@ from shared.solve.fit_head import FitWeights, fit_codes, fit_surface, triangulat
 
 MODEL = toy_head()
 ROTATION = rotation_from_vector(np.array([0.1, -0.2, 0.05]))
+WEIGHTS = FitWeights(track_mm=0.1, landmark_mm=2.0, aperture_mm=1000.0)  # three codes, and no lids
 SCALE, SHIFT = 0.9, np.array([3.0, -4.0, 10.0])
 
 
@@ -33,7 +34,7 @@ def observed(vertices, noise_mm=0.05):
 
 def test_codes_and_similarity_are_recovered():
     truth = true_head()
-    fit = fit_codes(MODEL, *observed(truth), FitWeights())
+    fit = fit_codes(MODEL, *observed(truth), WEIGHTS)
     assert np.allclose(fit.identity, [1.5, -1.0], atol=0.25)
     assert fit.expression[0] == pytest.approx(0.6, abs=0.15)
     assert fit.scale == pytest.approx(SCALE, rel=0.01)
@@ -43,7 +44,7 @@ def test_codes_and_similarity_are_recovered():
 def test_free_correction_takes_up_what_the_codes_cannot():
     truth = true_head(bump_mm=3.0)
     points, landmarks = observed(truth)
-    codes = fit_codes(MODEL, points, landmarks, FitWeights())
+    codes = fit_codes(MODEL, points, landmarks, WEIGHTS)
     free = fit_surface(MODEL, codes, points, FitWeights(stiffness=0.3))
     near = np.linalg.norm(truth - [30.0, 20.0, 80.0], axis=1) < 18.0
 
@@ -57,7 +58,7 @@ def test_free_correction_takes_up_what_the_codes_cannot():
 
 
 def test_poses_move_with_the_head():
-    fit = fit_codes(MODEL, *observed(true_head()), FitWeights())
+    fit = fit_codes(MODEL, *observed(true_head()), WEIGHTS)
     pose = rigid(np.diag([1.0, -1, -1]), np.array([1.0, 2.0, 900.0]))[None]
     lens = np.array([[1000.0, 0, 0], [0, 1000.0, 0], [0, 0, 1]])
     points = np.random.default_rng(1).normal(size=(20, 3)) * 50

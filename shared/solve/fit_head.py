@@ -49,15 +49,27 @@ class HeadFit:
         return poses
 
 
+EFFECTIVE_TRACKS = 100.0
+APERTURES = np.array(
+    [(160, 144), (159, 145), (158, 153), (387, 373), (386, 374), (385, 380), (82, 87), (13, 14), (312, 317)]
+)
+"""Pairs of landmarks above and below the openings of eyes and mouth."""
+
+
 @dataclass(frozen=True)
 class FitWeights:
-    """How much each kind of evidence counts; deviations in mm (or in the code's own unit)."""
+    """How much each kind of evidence counts: standard deviations in mm or in the code's own unit.
 
-    track_mm: float = 0.3
-    landmark_mm: float = 4.0
+    All tracks together count as EFFECTIVE_TRACKS: neighbours repeat each other, and fifty codes cannot follow a face to
+    a fraction of a millimetre. Landmarks tell the rough place, and how far lids and lips are open.
+    """
+
+    track_mm: float = 2.8
+    landmark_mm: float = 12.0
+    aperture_mm: float = 0.7
     identity: float = 1.0
-    expression: float = 0.4
-    stiffness: float = 30.0
+    expression: float = 0.6
+    stiffness: float = 8.0
 
 
 def fit_codes(
@@ -89,7 +101,7 @@ def _code_step(model, fit, points, landmarks, known, weights, usable, reach_mm) 
     basis = np.concatenate([model.identity_basis, model.expression_basis])
     neutral = model.template
     n = normals[near]
-    root = np.sqrt(weight)[:, None] / weights.track_mm
+    root = np.sqrt(weight * EFFECTIVE_TRACKS / len(points))[:, None] / weights.track_mm
     # n . (x_j + w x p + t + s p) with p the track point in head space, moving towards the surface point
     centre = in_head.mean(0)
     arm = in_head - centre
@@ -107,10 +119,14 @@ def _code_step(model, fit, points, landmarks, known, weights, usable, reach_mm) 
         moving = np.concatenate([np.cross(arm, unit), np.tile(unit, (len(arm), 1)), arm[:, [axis]]], axis=1)
         rows.append(gain[:, None] * np.concatenate([-moving, at[:, :, axis].T], axis=1))
         rhs.append(gain * (named - base)[:, axis])
+    opening, opening_rhs = _aperture_rows(model, fit, landmarks, weights.aperture_mm)
+    rows.append(opening)
+    rhs.append(opening_rhs)
     codes = len(basis)
-    deviation = np.r_[np.full(len(model.identity_basis), weights.identity)]
-    deviation = np.r_[deviation, np.full(len(model.expression_basis), weights.expression)]
-    rows.append(np.concatenate([np.zeros((codes, 7)), np.diag(1.0 / deviation)], axis=1) * np.sqrt(len(points) / 200.0))
+    deviation = np.r_[
+        np.full(len(model.identity_basis), weights.identity), np.full(len(model.expression_basis), weights.expression)
+    ]
+    rows.append(np.concatenate([np.zeros((codes, 7)), np.diag(1.0 / deviation)], axis=1))
     rhs.append(np.zeros(codes))
     lower = np.r_[np.full(7, -np.inf), np.full(len(model.identity_basis), -4.0), np.zeros(len(model.expression_basis))]
     upper = np.r_[np.full(7, np.inf), np.full(len(model.identity_basis), 4.0), np.ones(len(model.expression_basis))]
@@ -129,6 +145,21 @@ def _moved(model: HeadModel, fit: HeadFit, solved: np.ndarray, centre: np.ndarra
     identity, expression = np.split(solved[7:], [len(model.identity_basis)])
     vertices = model.shape(identity, expression)
     return HeadFit(fit.scale * grow, rotation, translation, identity, expression, vertices)
+
+
+def _aperture_rows(model, fit, landmarks, deviation_mm) -> tuple[np.ndarray, np.ndarray]:
+    """How far eyes and mouth are open tells the expression alone: heights between landmark pairs, in head space."""
+    pairs = APERTURES[(model.landmark_face[APERTURES] >= 0).all(1) & np.isfinite(landmarks[APERTURES]).all((1, 2))]
+    chosen = np.zeros(len(landmarks), bool)
+    chosen[pairs] = True
+    place = np.cumsum(chosen) - 1
+    by_code = _landmark_basis(model, model.expression_basis, chosen)[..., 1]
+    heights = model.landmarks(model.shape(fit.identity, np.zeros_like(fit.expression)))[:, 1]
+    observed = fit.to_head(landmarks)[:, 1]
+    rows = np.zeros((len(pairs), 7 + len(fit.identity) + len(fit.expression)))
+    rows[:, 7 + len(fit.identity) :] = (by_code[:, place[pairs[:, 0]]] - by_code[:, place[pairs[:, 1]]]).T
+    missing = (observed[pairs[:, 0]] - observed[pairs[:, 1]]) - (heights[pairs[:, 0]] - heights[pairs[:, 1]])
+    return rows / deviation_mm, missing / deviation_mm
 
 
 def _landmark_basis(model: HeadModel, basis: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -203,8 +203,9 @@ def _mesh_pass(clip, model, solution, reliable, fit, settings, index, progress) 
     usable_face = ~np.isin(model.face_segment, untracked)
     candidates = np.nonzero(reliable)[0]
     tracks, points = [], []
-    for chosen in choose_references(poses[candidates], settings.references):
-        reference = int(candidates[chosen])
+    references = choose_references(poses[candidates], settings.references)
+    for number, chosen in enumerate(references, start=1):
+        reference, label = int(candidates[chosen]), f"tracks, pass {index + 1}, view {number} of {len(references)}"
         grid = _mesh_grid(clip, model, scene, fit, usable_face, poses, reference, settings)
         found, where = dense_tracks(
             grid,
@@ -214,7 +215,7 @@ def _mesh_pass(clip, model, solution, reliable, fit, settings, index, progress) 
             visible,
             count=settings.tracks_per_reference,
             search_px=(0.015, 0.01)[min(index, 1)] * clip.face_width_px + 1.0,
-            progress=lambda frames: progress(frames, f"tracks, pass {index + 1}"),
+            progress=lambda frames, label=label: progress(frames, label),
         )
         tracks.append(found)
         points.append(points_on_grid(grid, where, fit.vertices))
