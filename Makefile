@@ -9,6 +9,7 @@ STAMP := $(VENV)/.installed
 .PHONY: setup demo test lint clean
 
 setup: $(STAMP)
+	$(BIN)/python -m tools.check_host
 	$(BIN)/python -m tools.setup_models
 
 $(STAMP): requirements.lock pyproject.toml

