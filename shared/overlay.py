@@ -29,7 +29,8 @@ def draw_overlay(picture, mesh: Mesh, scene: RayScene, camera_from_head, intrins
     """One frame with the mesh's edges where they face the camera, and the landmarks as dots."""
     zoom = max(1, round(720 / picture.shape[0]))
     canvas = cv2.resize(picture, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
-    visible = visible_vertices(scene, mesh.vertices, mesh.faces, camera_from_head, 0.05)
+    normals = vertex_normals(mesh.vertices, mesh.faces)
+    visible = visible_vertices(scene, mesh.vertices, normals, camera_from_head, 0.05)
     pixels = project(mesh.vertices, camera_from_head, intrinsics)[0] * zoom
     lines = canvas.copy()
     for a, b in _coarse_edges(mesh.faces):

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from shared.geometry import camera_centres
-from shared.mesh import interpolate, normalised, vertex_normals
+from shared.mesh import interpolate, normalised
 from shared.raycast import RayScene, camera_hits
 
 CRUSHED_CODE, CLIPPED_CODE = 8, 250
@@ -99,10 +99,9 @@ def grid_from_mesh(
 
 
 def visible_vertices(
-    scene: RayScene, vertices: np.ndarray, faces: np.ndarray, camera_from_head: np.ndarray, least_cosine: float
+    scene: RayScene, vertices: np.ndarray, normals: np.ndarray, camera_from_head: np.ndarray, least_cosine: float
 ) -> np.ndarray:
-    """[V] bool: faces the camera [4, 4] by at least that cosine, and nothing of the mesh stands between."""
-    normals = vertex_normals(vertices, faces)
+    """[V] bool: faces the camera [4, 4] by at least that cosine, and nothing of the scene stands between."""
     towards = normalised(camera_centres(camera_from_head) - vertices)
     seen = (normals * towards).sum(1) > least_cosine
     index = np.nonzero(seen)[0]

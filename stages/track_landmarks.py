@@ -33,7 +33,7 @@ STAGE = Stage(
         Parameter("warp_width", float, 480.0, "Width of the face in the flow's pictures.", "px", 100.0, 2000.0),
         Parameter("loss_scale", float, 0.2, "Residual beyond which a track loses its pull.", "px", 0.01, 10.0),
         Parameter("point_prior", float, 5.0, "Deviation of track points about the fitted head.", "mm", 0.01, 1000.0),
-        Parameter("stiffness", float, 8.0, "Resistance of the free shape correction to bending.", "", 0.01, 1e6),
+        Parameter("stiffness", float, 4.0, "Resistance of the free shape correction to bending.", "", 0.01, 1e6),
         Parameter("least_presence", float, 0.5, "Landmark network's confidence below which a frame is lost.", "", 0, 1),
         Parameter("largest_error", float, 1.5, "Median track error beyond which a frame is excluded.", "px", 0.1, 50.0),
     ),

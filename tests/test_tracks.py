@@ -5,6 +5,7 @@ import numpy as np
 from shapes import grid_plane
 
 from shared.geometry import project, rigid, rotation_from_vector
+from shared.mesh import vertex_normals
 from shared.raycast import RayScene, camera_hits
 from shared.tracks import (
     dense_tracks,
@@ -84,11 +85,12 @@ def test_visibility_needs_a_clear_and_frontal_view():
     near = PLANE.vertices * 0.3 + [0, 0, 100.0]
     vertices = np.concatenate([PLANE.vertices, near])
     faces = np.concatenate([PLANE.faces, PLANE.faces + len(PLANE.vertices)])
-    seen = visible_vertices(RayScene(vertices, faces), vertices, faces, poses()[0], 0.2)
+    scene, normals = RayScene(vertices, faces), vertex_normals(vertices, faces)
+    seen = visible_vertices(scene, vertices, normals, poses()[0], 0.2)
     assert not seen[len(PLANE.vertices) // 2]
     assert seen[len(PLANE.vertices) :].all() and seen[0]
     behind = rigid(np.diag([-1.0, -1, 1]), np.array([0, 0, 900.0]))
-    assert not visible_vertices(RayScene(vertices, faces), vertices, faces, behind, 0.2).any()
+    assert not visible_vertices(scene, vertices, normals, behind, 0.2).any()
 
 
 def test_clipped_and_crushed_pixels_are_unusable():

@@ -69,7 +69,7 @@ class FitWeights:
     aperture_mm: float = 0.7
     identity: float = 1.0
     expression: float = 0.6
-    stiffness: float = 8.0
+    stiffness: float = 4.0
 
 
 def fit_codes(
@@ -170,7 +170,7 @@ def _landmark_basis(model: HeadModel, basis: np.ndarray, known: np.ndarray) -> n
 
 def _fit_vertices(model: HeadModel) -> np.ndarray:
     """Indices of vertices that tracks may pull: skin, not eyeballs, inner mouth or scalp."""
-    unpulled = [i for i, name in enumerate(model.segment_names) if name in ("eyes", "inner_mouth", "scalp")]
+    unpulled = [i for i, name in enumerate(model.segment_names) if name in ("eyes", "eye_sockets", "inner_mouth", "scalp")]
     faces = model.faces[~np.isin(model.face_segment, unpulled)]
     return np.unique(faces)
 

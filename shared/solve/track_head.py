@@ -16,7 +16,7 @@ from shared.bundle import BundleSolution, adjust, pose_covariance, pose_from_poi
 from shared.errors import InputError
 from shared.geometry import camera_centres, project
 from shared.head_model import HeadModel
-from shared.mesh import normalised
+from shared.mesh import normalised, vertex_normals
 from shared.raycast import RayScene
 from shared.solve.fit_head import FitWeights, HeadFit, fit_codes, fit_surface, triangulate
 from shared.tracks import (
@@ -28,7 +28,7 @@ from shared.tracks import (
     visible_vertices,
 )
 
-UNTRACKED_SEGMENTS = ("eyes", "inner_mouth", "neck", "scalp", "ears", "lids")
+UNTRACKED_SEGMENTS = ("eyes", "eye_sockets", "inner_mouth", "neck", "scalp", "ears")
 """Not rigid with the skull, or hair: no tracks from there."""
 
 LEAST_TRACKS = 30
@@ -197,12 +197,14 @@ def _mesh_pass(clip, model, solution, reliable, fit, settings, index, progress) 
     poses = fit.camera_from_head(solution.camera_from_points)
     scene = RayScene(fit.vertices, model.faces)
     positions, _ = project(fit.vertices, poses, clip.intrinsics)
-    visible = np.stack([visible_vertices(scene, fit.vertices, model.faces, pose, 0.3) for pose in poses])
+    normals = vertex_normals(fit.vertices, model.faces)
+    visible = np.stack([visible_vertices(scene, fit.vertices, normals, pose, 0.3) for pose in poses])
     visible[~reliable] = False
     untracked = [i for i, name in enumerate(model.segment_names) if name in UNTRACKED_SEGMENTS]
     usable_face = ~np.isin(model.face_segment, untracked)
     candidates = np.nonzero(reliable)[0]
     tracks, points = [], []
+    count = settings.tracks_per_reference // (1 if index == settings.passes - 1 else 2)  # the last pass decides
     references = choose_references(poses[candidates], settings.references)
     for number, chosen in enumerate(references, start=1):
         reference, label = int(candidates[chosen]), f"tracks, pass {index + 1}, view {number} of {len(references)}"
@@ -213,7 +215,7 @@ def _mesh_pass(clip, model, solution, reliable, fit, settings, index, progress) 
             clip.unusable,
             positions,
             visible,
-            count=settings.tracks_per_reference,
+            count=count,
             search_px=(0.015, 0.01)[min(index, 1)] * clip.face_width_px + 1.0,
             progress=lambda frames, label=label: progress(frames, label),
         )
