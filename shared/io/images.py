@@ -88,7 +88,7 @@ def read_exr(path: Path | str) -> np.ndarray:
 def write_png(path: Path | str, array: np.ndarray) -> None:
     """Writes [H, W] or [H, W, 3] RGB, uint8 or uint16, losslessly."""
     ordered = array[..., ::-1] if array.ndim == 3 else array
-    if not cv2.imwrite(str(path), np.ascontiguousarray(ordered), [cv2.IMWRITE_PNG_COMPRESSION, 3]):
+    if not cv2.imwrite(str(path), np.ascontiguousarray(ordered), [cv2.IMWRITE_PNG_COMPRESSION, 1]):
         raise LimnError(f"{path}: could not be written")
 
 

@@ -1,0 +1,76 @@
+"""What the appearance stages read: sampled frames with the poses and the mesh that belong to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from shared.color import decode_transfer
+from shared.errors import InputError
+from shared.gather import Picture, prepare_picture
+from shared.io.arrays import load_arrays, read_json
+from shared.io.frames import FrameSet
+from shared.io.meshes import load_mesh, read_obj
+from shared.mesh import Mesh
+
+
+@dataclass(frozen=True)
+class ClipInputs:
+    """F frames with poses: camera_from_head [F, 4, 4]; intrinsics [3, 3] and size (width, height) of the pictures;
+    moves: "head" or "camera"; face_segment [faces] index into segment_names, or None where the mesh has none.
+
+    place [F]: each frame's place in frames.
+    """
+
+    mesh: Mesh
+    camera_from_head: np.ndarray
+    intrinsics: np.ndarray
+    size: tuple[int, int]
+    moves: str
+    frames: FrameSet
+    place: np.ndarray
+    face_segment: np.ndarray | None
+    segment_names: tuple[str, ...]
+
+    def picture(self, f: int) -> Picture:
+        """Frame f, decoded and ready for sampling."""
+        i = int(self.place[f])
+        codes = self.frames.read_codes(i)
+        steps = np.iinfo(codes.dtype).max
+        table = decode_transfer(np.arange(steps + 1) / steps, self.frames.transfer)
+        return prepare_picture(codes, table[codes], self.frames.read_mask(i))
+
+
+def read_inputs(
+    sampled: Path, tracked: Path, mesh_path: str = "", pose_path: str = ""
+) -> tuple[ClipInputs, FrameSet, np.ndarray]:
+    """From the folders of sample_frames and track_landmarks -> inputs, the frames, frame_index [F] in the source.
+
+    mesh_path (.npz or .obj) and pose_path (.npz) replace the tracked ones when not empty. InputError when fewer than
+    three poses belong to sampled frames.
+    """
+    frames = FrameSet.open(sampled)
+    path = Path(mesh_path) if mesh_path else tracked / "mesh.npz"
+    mesh = read_obj(path) if path.suffix == ".obj" else load_mesh(path)
+    segment = load_arrays(path).get("face_segment") if path.suffix == ".npz" else None
+    names = tuple(read_json(tracked / "tracking.json")["segments"])
+    poses = load_arrays(Path(pose_path) if pose_path else tracked / "poses.npz")
+    pose, index, place = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
+    inputs = ClipInputs(mesh, pose, frames.intrinsics, frames.size, frames.moves, frames, place, segment, names)
+    return inputs, frames, index
+
+
+def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses of sampled frames [F, 4, 4], their frame_index [F] and place in the frame set [F]."""
+    if "camera_from_head" not in poses:
+        raise InputError("no camera_from_head", where=where, got=", ".join(sorted(poses)))
+    pose = poses["camera_from_head"].astype(np.float64)
+    index = poses.get("frame_index", np.arange(len(pose)))
+    place = {int(frame): i for i, frame in enumerate(frames.frame_index)}
+    kept = [i for i, frame in enumerate(index) if int(frame) in place]
+    if len(kept) < 3:
+        raise InputError("too few poses belong to sampled frames", where=where, got=len(kept), expected="3 or more")
+    index = np.asarray(index)[kept].astype(np.int64)
+    return pose[kept], index, np.array([place[int(frame)] for frame in index])

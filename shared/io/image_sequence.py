@@ -1,0 +1,142 @@
+"""Numbered image files as a video: PNG, TIFF and JPEG through FFmpeg (8 and 16 bit), linear EXR through OpenEXR."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+from av.video.reformatter import VideoReformatter
+
+from shared.errors import InputError
+from shared.io.images import read_exr
+from shared.io.pixel_format import has_alpha
+from shared.io.source import (
+    DEFAULT_FPS,
+    MAX_PIXELS,
+    ArrayFrame,
+    DecodedFrame,
+    SourceFrame,
+    VideoInfo,
+    check_length,
+    check_size,
+)
+
+KINDS = ".png .tif .tiff .jpg .jpeg .exr"
+_FORMATS = "png_pipe,tiff_pipe,jpeg_pipe,image2"
+_COUNTER = re.compile(r"%(?:0?\d+)?d")
+
+
+def is_sequence(path: Path | str) -> bool:
+    """Whether the file name holds a printf counter such as %05d."""
+    return _COUNTER.search(Path(path).name) is not None
+
+
+class ImageSequenceReader:
+    """Image files counted by a pattern; the lowest number is frame 0, a gap in the numbers a gap in time.
+
+    An EXR counts as linear: its values from 0 to 1 become the 16-bit code range, what is brighter is clipped.
+    """
+
+    def __init__(self, pattern: Path | str) -> None:
+        """Lists the files and reads the first. InputError where there is none or it cannot be read."""
+        self.pattern = Path(pattern)
+        self._files = _numbered_files(self.pattern)
+        self._first_number = min(self._files)
+        span = max(self._files) - self._first_number + 1
+        check_length(span, str(self.pattern))
+        first = self._files[self._first_number]
+        self._reformatter = VideoReformatter()
+        frame = self._read(0, first)
+        if frame.fault:
+            raise InputError(f"the first image is unusable: {frame.fault}", where=str(first))
+        codes = frame.codes()
+        warnings = (f"{span - len(self._files)} numbers are missing in the sequence",) * (span != len(self._files))
+        if isinstance(frame, DecodedFrame) and has_alpha(frame.picture):
+            warnings += ("the images' alpha channel is ignored",)
+        self.info = VideoInfo(
+            width=codes.shape[1],
+            height=codes.shape[0],
+            fps=DEFAULT_FPS,
+            frame_count=span,
+            codec=first.suffix[1:].lower(),
+            bits=codes.dtype.itemsize * 8,
+            transfer_tag="linear" if _is_exr(first) else "",
+            warnings=warnings,
+        )
+
+    def __iter__(self) -> Iterator[tuple[int, np.ndarray]]:
+        return ((frame.index, frame.codes()) for frame in self.frames())
+
+    def frames(self, indices: Collection[int] | None = None) -> Iterator[SourceFrame]:
+        """Frames by rising index, all of them or only those of `indices`; numbers without a file are left out."""
+        wanted = None if indices is None else frozenset(indices)
+        for number in sorted(self._files):
+            index = number - self._first_number
+            if wanted is None or index in wanted:
+                yield self._checked(self._read(index, self._files[number]))
+
+    def _checked(self, frame: SourceFrame) -> SourceFrame:
+        """The frame, with a fault where its size or its depth is not the first frame's."""
+        if frame.fault:
+            return frame
+        codes = frame.codes()
+        fault = ""
+        if codes.shape[:2] != (self.info.height, self.info.width):
+            fault = "its size differs from the first frame's"
+        elif codes.dtype.itemsize * 8 != self.info.bits:
+            fault = "its bit depth differs from the first frame's"
+        return ArrayFrame(frame.index, frame.time_s, fault, codes)
+
+    def _read(self, index: int, file: Path) -> SourceFrame:
+        time_s = round(index / DEFAULT_FPS, 6)
+        if _is_exr(file):
+            return _read_linear_exr(index, time_s, file)
+        try:
+            with av.open(f"file:{file}", options={"protocol_whitelist": "file", "format_whitelist": _FORMATS}) as image:
+                context = image.streams.video[0].codec_context
+                check_size(context.width, context.height, str(file))
+                context.options = {"max_pixels": str(MAX_PIXELS)}
+                picture = next(image.decode(video=0))
+        except InputError as error:
+            return SourceFrame(index, time_s, error.what)
+        except (av.error.FFmpegError, OSError, StopIteration, IndexError):
+            return SourceFrame(index, time_s, "not an image that can be read")
+        fault = "damaged in the file" if picture.is_corrupt else ""
+        return DecodedFrame(index, time_s, fault, picture, self._reformatter, round(picture.rotation / 90) % 4)
+
+
+def _is_exr(file: Path) -> bool:
+    return file.suffix.lower() == ".exr"
+
+
+def _read_linear_exr(index: int, time_s: float, file: Path) -> SourceFrame:
+    try:
+        linear = read_exr(file)
+        check_size(linear.shape[1], linear.shape[0], str(file))
+    except InputError as error:
+        return SourceFrame(index, time_s, error.what)
+    if not np.isfinite(linear).all():
+        return SourceFrame(index, time_s, "NaN or infinite values")
+    if linear.ndim == 2:
+        linear = np.repeat(linear[..., None], 3, axis=2)
+    codes = np.rint(linear.clip(0, 1) * 65535).astype(np.uint16)
+    return ArrayFrame(index, time_s, "", np.ascontiguousarray(codes))
+
+
+def _numbered_files(pattern: Path) -> dict[int, Path]:
+    """Number -> file for the one counter in the pattern's name."""
+    if len(_COUNTER.findall(pattern.name)) != 1 or pattern.suffix.lower() not in KINDS.split():
+        raise InputError("not a pattern for an image sequence", where=str(pattern), expected="frames/%05d.png",
+                         mend=f"one counter in the file name, and one of {KINDS}")
+    if not pattern.parent.is_dir():
+        raise InputError("the folder of the image sequence is missing", where=str(pattern.parent))
+    before, after = _COUNTER.split(pattern.name)
+    name = re.compile(re.escape(before) + r"(\d{1,9})" + re.escape(after))
+    matches = ((name.fullmatch(file.name), file) for file in sorted(pattern.parent.iterdir()))
+    files = {int(match[1]): file for match, file in matches if match and file.is_file()}
+    if not files:
+        raise InputError("no image matches the pattern", where=str(pattern), mend="correct `video` in subject.yaml")
+    return files

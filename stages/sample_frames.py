@@ -1,0 +1,176 @@
+"""Sample frames: from the clip to cropped, lossless frames with masks.
+
+Reads    the subject's video (or numbered images), lens and transfer function.
+Writes   frames.json, frames/%06d.png (the crop in the source's own code values), masks/%06d.png, contact_sheet.png.
+Method   A first pass looks at up to four times as many frames as wanted, in small: follows the faces, and measures
+         sharpness and change against the neighbours. Faulty, black, alien, faceless, repeated and blurred frames go,
+         each with its reason; the rest is thinned to an even spacing in time. One crop holds the whole head in all of
+         them. A second pass decodes just these frames in full. Codes are stored as they are and linearised when read:
+         rounding linear light to integers would lose the shadows.
+Fails    nothing can be decoded; no face is found; fewer than three frames are usable.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shared.contract import Job, Output, Parameter, Stage, main
+from shared.errors import LimnError
+
+STAGE = Stage(
+    name="sample_frames",
+    version=1,
+    help="Decode the clip, choose good frames evenly in time, crop them to the head and mask the person.",
+    inputs=(),
+    outputs=(
+        Output("frames.json", "frames with their times, the crop and its camera, dropped frames with the reason"),
+        Output("frames/*.png", "the crop in the source's code values", space="crop", colour_space="source"),
+        Output("masks/*.png", "0 background, 128 person, 255 face", space="crop"),
+        Output("contact_sheet.png", "nine of the crops with their masks' outlines", colour_space="srgb"),
+    ),
+    parameters=(
+        Parameter("frame_count", int, 150, "Frames to keep at most.", "frames", 3, 2000),
+        Parameter("max_size", int, 1024, "Longest side of the crop; larger ones are scaled down.", "px", 128, 4096),
+        Parameter("blurred_below", float, 0.4, "Frames less sharp than this share of their neighbours are dropped.",
+                  "", 0.0, 1.0),
+    ),
+)
+
+CLIPPED_WARNING = 0.1
+FACE = 255
+
+
+def run(job: Job) -> None:
+    """Survey, select, crop, write."""
+    from shared.framing import crop_intrinsics
+    from shared.io.arrays import write_json
+    from shared.io.cameras import source_intrinsics
+    from shared.io.models import load_face_networks
+    from shared.io.video import open_video
+    from shared.solve.sample_clip import select_frames, survey_clip
+
+    subject, params = job.subject, job.params
+    reader, networks = open_video(subject.video), load_face_networks()
+    info = reader.info
+    survey = survey_clip(reader, networks, subject.transfer, params.frame_count, job.progress)
+    selection = select_frames(survey, info, str(subject.video), frame_count=params.frame_count,
+                              max_size=params.max_size, blurred_below=params.blurred_below,
+                              head_moves=subject.moves == "head")
+    job.note(selection.summary)
+    intrinsics, focal_known, focal_warning = source_intrinsics(
+        info, subject.focal_length_px, subject.focal_length_mm, subject.sensor_width_mm)
+    records, picture_warnings = write_frames(reader, selection, networks, job)
+    warnings = [*info.warnings, *transfer_warnings(info.transfer_tag, subject.transfer), *selection.warnings,
+                *picture_warnings, *[focal_warning] * (not focal_known)]
+    write_json(job.out / "frames.json", {
+        "source": {"name": subject.video.name, "width": info.width, "height": info.height, "fps": info.fps,
+                   "frame_count": info.frame_count, "codec": info.codec, "rotation_deg": info.rotation},
+        "transfer": subject.transfer,
+        "moves": subject.moves,
+        "crop": selection.crop._asdict(),
+        "size": list(selection.crop.size),
+        "intrinsics": crop_intrinsics(intrinsics, selection.crop).tolist(),
+        "intrinsics_source": intrinsics.tolist(),
+        "focal_known": focal_known,
+        "frames": records,
+        "dropped": selection.dropped,
+        "warnings": warnings,
+    })
+    for text in warnings:
+        job.warn(text)
+
+
+def transfer_warnings(tag: str, transfer: str) -> list[str]:
+    """What does not fit between the transfer function that the file names and the one that the subject states."""
+    if tag in ("pq", "hlg"):
+        return [f"the video is tagged as HDR ({tag}) but read as {transfer}: colours and light will be off"]
+    if tag == "linear" and transfer != "linear":
+        return [f"the images are linear but read as {transfer}: set colour.transfer to linear"]
+    return []
+
+
+def write_frames(reader, selection, networks, job: Job) -> tuple[list[dict], list[str]]:
+    """The second pass: crops, masks and the contact sheet -> one record per frame, and warnings."""
+    from shared.contact_sheet import ContactSheet
+    from shared.crop_pixels import area_average, clipped_share, display_codes, frame_mask, is_grey
+    from shared.io.images import write_png
+
+    for folder in ("frames", "masks"):
+        (job.out / folder).mkdir(parents=True, exist_ok=True)
+    crop, transfer, count = selection.crop, job.subject.transfer, len(selection.frame_index)
+    sheet, records, clipped, grey = ContactSheet(count), [], [], []
+    frames = reader.frames(selection.frame_index)
+    for i, frame in enumerate(job.progress(frames, "cropping", total=count)):
+        part = frame.codes()[crop.y0:crop.y0 + crop.height, crop.x0:crop.x0 + crop.width]
+        codes = area_average(part, crop.size, transfer)
+        rgb = display_codes(codes, transfer)
+        points = (selection.landmarks[i][:, :2] - (crop.x0, crop.y0)) * crop.scale
+        mask = frame_mask(rgb, networks.person_mask(rgb), points)
+        records.append(frame_record(frame.index, frame.time_s, points, selection.sharpness[i]))
+        write_png(job.out / records[-1]["file"], codes)
+        write_png(job.out / records[-1]["mask"], mask)
+        clipped.append(clipped_share(codes, mask))
+        grey.append(is_grey(codes))
+        sheet.add(rgb, mask)
+    write_png(job.out / "contact_sheet.png", sheet.picture())
+    warnings = []
+    if np.mean(clipped) > CLIPPED_WARNING:
+        warnings.append(f"{np.mean(clipped):.0%} of the face is overexposed: expose it darker")
+    if np.mean(grey) > 0.5:
+        warnings.append("the clip has no colour: the maps will be grey")
+    return records, warnings
+
+
+def frame_record(frame_index: int, time_s: float, points: np.ndarray, sharpness: float) -> dict:
+    """One entry of frames.json. points: landmarks [468, 2] crop px. sharpness: relative to the neighbours."""
+    name = f"{frame_index:06d}.png"
+    edges = np.concatenate([points.min(axis=0), points.max(axis=0)])
+    return {
+        "frame_index": frame_index,
+        "time_s": time_s,
+        "file": f"frames/{name}",
+        "mask": f"masks/{name}",
+        "sharpness": round(float(sharpness), 4),
+        "face_box": [round(float(edge), 2) for edge in edges],
+    }
+
+
+def check(job: Job) -> None:
+    """Frames in order and of one size, the crop inside the source, its camera consistent, a face in every mask."""
+    from shared.framing import Crop
+    from shared.io.arrays import read_json
+    from shared.io.frames import FrameSet
+
+    frames, crop = FrameSet.open(job.out), Crop(**read_json(job.out / "frames.json")["crop"])
+    source_width, source_height = frames.source_size
+    inside = 0 <= crop.x0 <= source_width - crop.width and 0 <= crop.y0 <= source_height - crop.height
+    require(inside, f"{crop} leaves the source of {source_width} x {source_height} px")
+    require(crop.scale <= 1 and max(crop.size) <= job.params.max_size, f"{crop} is too large")
+    require(frames.size == crop.size, f"size {frames.size} is not the crop's {crop.size}")
+    require(3 <= frames.count <= job.params.frame_count, f"{frames.count} frames")
+    require(bool(np.all(np.diff(frames.frame_index) > 0)), "frames are not in order")
+    require(bool(np.all(np.diff(frames.time_s) > 0)), "times do not rise")
+    corner = frames.intrinsics @ np.linalg.inv(frames.intrinsics_source) @ (crop.x0, crop.y0, 1.0)
+    require(np.allclose(corner, (0, 0, 1), atol=1e-6), "the crop's intrinsics do not belong to the crop")
+    for i in range(frames.count):
+        check_frame(frames, i)
+
+
+def check_frame(frames, i: int) -> None:
+    """Sizes, mask values, and a face that is not of one colour."""
+    codes, mask = frames.read_codes(i), frames.read_mask(i)
+    size = frames.size[::-1]
+    require(codes.shape == (*size, 3) and mask.shape == size, f"{frames.files[i]}: wrong size")
+    require(set(np.unique(mask).tolist()) <= {0, 128, FACE}, f"{frames.mask_files[i]}: values besides 0, 128, 255")
+    require(bool((mask == FACE).any()), f"{frames.mask_files[i]}: no face")
+    require(int(np.ptp(codes[mask == FACE])) > 0, f"{frames.files[i]}: the face is of one colour")
+
+
+def require(condition: bool, what: str) -> None:
+    """LimnError unless the condition holds."""
+    if not condition:
+        raise LimnError(f"sample_frames: {what}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(STAGE, run, check))

@@ -1,0 +1,222 @@
+"""Video and image sequences: exact values, times, rotation, bounds, and one clear error per fault."""
+
+import struct
+from fractions import Fraction
+
+import av
+import cv2
+import numpy as np
+import pytest
+from toy_video import drawn_face, turning_face, write_sound, write_video
+
+from shared.errors import InputError
+from shared.io import source
+from shared.io.images import write_exr, write_png
+from shared.io.video import open_video, probe
+
+
+def test_times_follow_a_variable_frame_rate(tmp_path):
+    stamps = [0, 40, 80, 200, 240, 400]
+    reader = open_video(write_video(tmp_path / "clip.mkv", turning_face(6), pts_ms=stamps))
+    frames = list(reader.frames())
+    assert [frame.index for frame in frames] == list(range(6))
+    assert [frame.time_s for frame in frames] == pytest.approx([stamp / 1000 for stamp in stamps], abs=0.002)
+    assert reader.info.frame_count == 6
+
+
+@pytest.mark.parametrize("rotation", [90, 180, -90])
+def test_the_rotation_flag_is_honoured(tmp_path, rotation):
+    upright = turning_face(3)
+    stored = [np.rot90(rgb, -rotation // 90) for rgb in upright]
+    reader = open_video(write_video(tmp_path / "clip.mp4", stored, rotation=rotation))
+    assert (reader.info.width, reader.info.height) == (240, 200)
+    assert reader.info.rotation == rotation % 360
+    for index, codes in reader:
+        assert np.abs(codes.astype(int) - upright[index]).mean() < 4
+    assert next(reader.frames()).codes((120, 100)).shape == (100, 120, 3)
+
+
+def test_chosen_frames_are_the_same_as_in_a_full_pass(tmp_path):
+    reader = open_video(write_video(tmp_path / "clip.mp4", turning_face(20), options={"bf": "3", "crf": "20"}))
+    whole = dict(reader)
+    some = {frame.index: frame.codes() for frame in reader.frames([3, 11, 17])}
+    assert sorted(some) == [3, 11, 17]
+    assert all(np.array_equal(whole[i], codes) for i, codes in some.items())
+
+
+def test_ten_bit_video_keeps_its_depth(tmp_path):
+    path = write_video(tmp_path / "clip.mkv", turning_face(2), codec="ffv1", pixel_format="yuv444p10le")
+    reader = open_video(path)
+    codes = next(reader.frames()).codes()
+    assert reader.info.bits == 10 and codes.dtype == np.uint16
+    assert np.abs(codes / 257.0 - turning_face(1)[0]).mean() < 0.5
+
+
+def test_hdr_and_wide_gamut_tags_are_reported(tmp_path):
+    path = write_video(tmp_path / "clip.mkv", turning_face(2), codec="ffv1", pixel_format="yuv444p10le", matrix=9,
+                       colour={"color_trc": 18, "color_primaries": 9})
+    info = probe(path)
+    assert info.transfer_tag == "hlg"
+    assert any("BT.2020" in text for text in info.warnings)
+
+
+def test_gif(tmp_path):
+    frames = turning_face(5)
+    with av.open(str(tmp_path / "clip.gif"), "w") as container:
+        stream = container.add_stream("gif", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 240, 200, "rgb8"
+        for rgb in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
+        container.mux(stream.encode())
+    reader = open_video(tmp_path / "clip.gif")
+    decoded = dict(reader)
+    assert reader.info.frame_count == len(decoded) == 5
+    assert np.abs(decoded[4].astype(int) - frames[4]).mean() < 25
+
+
+@pytest.mark.parametrize(("suffix", "kind"), [("png", np.uint8), ("png", np.uint16), ("tif", np.uint16)])
+def test_image_sequences_are_read_exactly(tmp_path, suffix, kind):
+    rng = np.random.default_rng(3)
+    images = rng.integers(0, np.iinfo(kind).max + 1, (3, 20, 30, 3)).astype(kind)
+    for number, image in zip((7, 8, 11), images, strict=True):
+        cv2.imwrite(str(tmp_path / f"shot_{number:04d}.{suffix}"), image[..., ::-1])
+    reader = open_video(tmp_path / f"shot_%04d.{suffix}")
+    frames = dict(reader)
+    assert sorted(frames) == [0, 1, 4] and reader.info.frame_count == 5
+    assert all(np.array_equal(frames[i], image) for i, image in zip((0, 1, 4), images, strict=True))
+    assert any("missing" in text for text in reader.info.warnings)
+
+
+def test_grey_and_alpha_images_become_rgb(tmp_path):
+    grey = np.random.default_rng(0).integers(0, 256, (20, 30), np.uint8)
+    for i in range(2):
+        write_png(tmp_path / f"grey_{i}.png", grey)
+        cv2.imwrite(str(tmp_path / f"alpha_{i}.png"), np.dstack([grey, grey, grey, grey // 2]))
+    assert np.array_equal(dict(open_video(tmp_path / "grey_%d.png"))[1], np.dstack([grey] * 3))
+    alpha = open_video(tmp_path / "alpha_%d.png")
+    assert np.array_equal(dict(alpha)[0], np.dstack([grey] * 3))
+    assert any("alpha" in text for text in alpha.info.warnings)
+
+
+def test_linear_exr_becomes_sixteen_bit_and_bad_values_are_a_fault(tmp_path):
+    linear = np.random.default_rng(0).uniform(0, 1.2, (20, 30, 3)).astype(np.float32)
+    write_exr(tmp_path / "f.000.exr", linear, colour_space="lin_rec709_scene")
+    write_exr(tmp_path / "f.001.exr", linear[:, :20], colour_space="lin_rec709_scene")
+    (tmp_path / "f.002.exr").write_bytes((tmp_path / "f.000.exr").read_bytes()[:500])
+    reader = open_video(tmp_path / "f.%03d.exr")
+    frames = list(reader.frames())
+    assert reader.info.transfer_tag == "linear"
+    assert np.abs(frames[0].codes() / 65535 - linear.clip(0, 1)).max() < 1e-5
+    assert [bool(frame.fault) for frame in frames] == [False, True, True]
+
+
+def test_not_a_number_in_an_exr_is_a_fault(tmp_path, monkeypatch):
+    monkeypatch.setattr("shared.io.image_sequence.read_exr", lambda file: np.full((20, 30, 3), np.nan, np.float32))
+    (tmp_path / "f.0.exr").write_bytes(b"exr")
+    with pytest.raises(InputError, match="NaN"):
+        open_video(tmp_path / "f.%d.exr")
+
+
+def cut_in_half(path):
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    return path
+
+
+def bad_zero(folder):
+    (folder / "clip.mp4").touch()
+    return folder / "clip.mp4"
+
+
+def bad_text(folder):
+    (folder / "clip.mp4").write_text("not a film\n" * 50)
+    return folder / "clip.mp4"
+
+
+def bad_playlist(folder):
+    (folder / "clip.mp4").write_text("#EXTM3U\n#EXTINF:1,\nfile:///etc/hostname\n")
+    return folder / "clip.mp4"
+
+
+def bad_no_index(folder):
+    return cut_in_half(write_video(folder / "clip.mp4", turning_face(30)))
+
+
+def bad_cut_fast_start(folder):
+    noise = [np.random.default_rng(i).integers(0, 256, (96, 96, 3), np.uint8) for i in range(30)]
+    return cut_in_half(write_video(folder / "clip.avi", noise, codec="mjpeg", pixel_format="yuvj420p", matrix=None))
+
+
+def bad_cut_matroska(folder):
+    return cut_in_half(write_video(folder / "clip.mkv", turning_face(30)))
+
+
+def bad_gif_bomb(folder):
+    size = struct.pack("<HH", 65000, 65000)
+    image = b"," + struct.pack("<HH", 0, 0) + size + b"\x00\x02\x02D\x01\x00;"
+    (folder / "clip.gif").write_bytes(b"GIF89a" + size + b"\x80\x00\x00" + bytes(6) + image)
+    return folder / "clip.gif"
+
+
+def bad_counter(folder):
+    return folder / "%03d_%03d.png"
+
+
+def bad_first_image(folder):
+    (folder / "0.png").write_bytes(b"\x89PNG nothing")
+    return folder / "%d.png"
+
+
+BAD = {
+    "zero bytes": (bad_zero, "0 bytes"),
+    "text": (bad_text, "not a video"),
+    "a playlist that names another file": (bad_playlist, "not a video"),
+    "no index": (bad_no_index, "not a video"),
+    "cut off, header first": (bad_cut_fast_start, "cut off"),
+    "cut off Matroska": (bad_cut_matroska, "cut off"),
+    "sound only": (lambda folder: write_sound(folder / "clip.m4a"), "no video stream"),
+    "missing": (lambda folder: folder / "clip.mp4", "missing"),
+    "a folder": (lambda folder: folder, "folder"),
+    "huge GIF": (bad_gif_bomb, "size|large"),
+    "8 px": (lambda folder: write_video(folder / "clip.mp4", [np.zeros((8, 8, 3), np.uint8)] * 3), "too small"),
+    "oblong pixels": (lambda folder: write_video(folder / "c.mp4", turning_face(3), aspect=Fraction(4, 3)), "square"),
+    "two counters": (bad_counter, "not a pattern"),
+    "no image": (lambda folder: folder / "%05d.png", "no image"),
+    "no image folder": (lambda folder: folder / "frames" / "%05d.png", "folder"),
+    "first image damaged": (bad_first_image, "first image"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_one_clear_line(tmp_path, name):
+    make, words = BAD[name]
+    path = make(tmp_path)
+    with pytest.raises(InputError, match=words) as caught:
+        for _ in open_video(path).frames():
+            pass
+    assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
+
+
+def test_length_and_size_are_bounded(tmp_path, monkeypatch):
+    path = write_video(tmp_path / "clip.mp4", turning_face(12))
+    monkeypatch.setattr(source, "MAX_FRAMES", 10)
+    with pytest.raises(InputError, match="too long"):
+        open_video(path)
+    monkeypatch.setattr(source, "MAX_PIXELS", 1000)
+    with pytest.raises(InputError, match="too large"):
+        open_video(path)
+
+
+def test_a_damaged_packet_costs_single_frames_only(tmp_path):
+    path = write_video(tmp_path / "clip.avi", turning_face(20), codec="mjpeg", pixel_format="yuvj420p", matrix=None)
+    content = bytearray(path.read_bytes())
+    with av.open(str(path)) as container:
+        packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    start, size = packets[9]
+    content[start + size // 3:start + size] = bytes(size - size // 3)
+    path.write_bytes(content)
+    frames = {frame.index: frame for frame in open_video(path).frames()}
+    assert 19 <= len(frames) <= 20
+    sound = [frame.codes() for frame in frames.values() if not frame.fault]
+    assert len(sound) >= 18
+    assert np.abs(sound[0].astype(int) - drawn_face((90, 95))).mean() < 8
