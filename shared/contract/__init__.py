@@ -1,0 +1,13 @@
+"""What a stage is: its declaration, its command line, its manifest. Imports nothing heavy.
+
+A stage file declares `STAGE = Stage(...)`, defines `run(job)` and `check(job)` and ends with
+`raise SystemExit(main(STAGE, run, check))`. Keep torch, cv2 and the like out of its top level (import them where they
+are used): a stage whose result is current then answers at once.
+"""
+
+from shared.contract.cli import main
+from shared.contract.declare import Output, Parameter, Stage
+from shared.contract.job import Job
+from shared.contract.subject import Subject, load_subject
+
+__all__ = ["Job", "Output", "Parameter", "Stage", "Subject", "load_subject", "main"]

@@ -1,0 +1,128 @@
+"""The command line of one stage: `python -m stages.<name> --subject DIR [--out DIR] [--set key=value ...]`.
+
+Exit code 0: done or current. 2: the input is at fault, one line says how, nothing is written. 1: ours is the fault.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from shared.contract.currency import reasons_to_run, work_to_do
+from shared.contract.declare import Stage
+from shared.contract.execute import execute
+from shared.contract.folders import RunFolder
+from shared.contract.hashing import HashMemory
+from shared.contract.job import Job
+from shared.contract.pipeline import load_pipeline, split_settings
+from shared.contract.progress import Reporter
+from shared.contract.subject import Subject, load_subject
+from shared.errors import InputError
+
+_LOCK_WAIT_S = 10.0
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True)
+class Request:
+    """What one call of a stage asks for, checked."""
+
+    stage: Stage
+    subject: Subject
+    run: RunFolder
+    parameters: dict[str, object]
+    threads: int
+    force: bool
+    verify: bool
+    events: Path | None
+
+
+def main(stage: Stage, run: Callable[[Job], None], check: Callable[[Job], None] | None = None,
+         argv: Sequence[str] | None = None) -> int:
+    """Runs the stage unless its result is current; returns the exit code."""
+    events = None
+    try:
+        request = parse_request(stage, argv)
+        events = request.events
+        with request.run.locked(stage.name, _LOCK_WAIT_S):
+            request.run.remove_leftovers(stage.name)
+            if answer_current(request):
+                return 0
+            set_threads(request.threads)
+            return execute(request, run, check)
+    except InputError as error:
+        report_input_error(stage.name, error, events)
+        return 2
+
+
+def report_input_error(name: str, error: InputError, events: Path | None) -> None:
+    """The one line that says what is wrong with the input."""
+    Reporter(name, None, events).event("input_error", message=str(error))
+    sys.stderr.write(f"{name}: {error}\n")
+
+
+def answer_current(request: Request) -> bool:
+    """True when the published result is the one asked for; its stamp is written then."""
+    if request.force:
+        return False
+    memory = HashMemory(request.run.memory, request.verify)
+    work = work_to_do(request.stage, request.subject, request.run, request.parameters, memory)
+    if reasons_to_run(work, request.run, memory):
+        return False
+    memory.save()
+    request.run.write_stamp(request.stage.name)
+    reporter = Reporter(request.stage.name, None, request.events)
+    reporter.event("current")
+    reporter.note(f"current: {request.run.published(request.stage.name)}")
+    return True
+
+
+class _OneLineParser(argparse.ArgumentParser):
+    def error(self, message: str) -> None:
+        raise InputError(message, mend="see --help")
+
+
+def make_parser(stage: Stage) -> argparse.ArgumentParser:
+    """The stage's command line, with its parameters in the help text."""
+    lines = [f"  {p.name:24} {p.help} Default {p.default}; {p.expected}." for p in stage.parameters]
+    parser = _OneLineParser(prog=f"python -m stages.{stage.name}", description=stage.help,
+                            epilog="parameters:\n" + "\n".join(lines), formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--subject", type=Path, required=True, metavar="DIR", help="folder with subject.yaml")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write to DIR/<subject>/, not to the subject's folder")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a parameter; may be repeated")
+    parser.add_argument("--preset", help="preset of pipeline.yaml (its default_preset)")
+    parser.add_argument("--pipeline", type=Path, metavar="FILE", help="another pipeline.yaml")
+    parser.add_argument("--threads", type=int, metavar="N", help="cores to use (all)")
+    parser.add_argument("--force", action="store_true", help="run even if the result is current")
+    parser.add_argument("--verify", action="store_true", help="read every file again to see whether it is current")
+    parser.add_argument("--events", type=Path, help=argparse.SUPPRESS)
+    return parser
+
+
+def parse_request(stage: Stage, argv: Sequence[str] | None) -> Request:
+    """Command line -> Request; InputError for whatever is wrong with it, the subject or pipeline.yaml."""
+    args = make_parser(stage).parse_args(argv)
+    subject = load_subject(args.subject)
+    prefix = f"{stage.name}."
+    settings = [text if text.startswith(prefix) else prefix + text for text in args.set]
+    given = split_settings(settings, [stage.name]).get(stage.name, {})
+    parameters = load_pipeline(args.pipeline).parameters(stage, args.preset, given)
+    threads = len(os.sched_getaffinity(0)) if args.threads is None else args.threads
+    if threads < 1:
+        raise InputError("number of threads not allowed", where="--threads", got=threads, expected=">= 1")
+    run = RunFolder.of(subject.folder, subject.name, args.out)
+    return Request(stage, subject, run, parameters, threads, args.force, args.verify, args.events)
+
+
+def set_threads(count: int) -> None:
+    """Limits the libraries to so many threads; sums then run in one order."""
+    for name in _THREAD_VARIABLES:
+        os.environ[name] = str(count)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(count)
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(count)

@@ -1,0 +1,193 @@
+"""What a stage declares: name, version, inputs, outputs, parameters.
+
+One declaration gives the command line, the validation, the cache key, the manifest and the table in the README.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import PurePosixPath
+
+from shared.contract.wording import unknown_name
+from shared.errors import InputError
+
+_NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
+_COUNTER = re.compile(r"%(?:0?\d+)?d")
+_TRUE, _FALSE, _NONE = ("true", "yes", "on", "1"), ("false", "no", "off", "0"), ("none", "null", "")
+_KIND = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One setting of a stage. A default of None means 'not set' and lets users give none.
+
+    type: int, float, bool or str. help: one sentence. unit: '' for counts, ratios and names. minimum, maximum:
+    inclusive. choices: all allowed values.
+    """
+
+    name: str
+    type: type
+    default: object
+    help: str
+    unit: str = ""
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple = ()
+
+    def __post_init__(self) -> None:
+        if not _NAME.match(self.name) or self.type not in _KIND or not self.help:
+            raise ValueError(f"parameter {self.name!r} needs a snake_case name, int|float|bool|str and a sentence")
+        object.__setattr__(self, "default", self.parse(self.default, f"default of {self.name}"))
+
+    def parse(self, value: object, where: str) -> object:
+        """`value`, from Python, YAML or a command line, as this parameter's type and in its range; else InputError."""
+        if value is None or (isinstance(value, str) and value.lower() in _NONE and self.default is None):
+            if self.default is None:
+                return None
+            raise InputError("no value", where=where, expected=self.expected)
+        typed = self._typed(value)
+        if typed is None or not self._allowed(typed):
+            raise InputError("value not allowed", where=where, got=repr(value), expected=self.expected)
+        return typed
+
+    def _typed(self, value: object) -> object | None:
+        """`value` as int, float, bool or str; None when it is no such thing."""
+        if self.type is bool:
+            text = str(value).lower()
+            return True if text in _TRUE else False if text in _FALSE else None
+        if self.type is str:
+            return str(value) if isinstance(value, str | int | float) and not isinstance(value, bool) else None
+        if isinstance(value, bool) or not isinstance(value, int | float | str):
+            return None
+        try:
+            number = float(value)
+            if not math.isfinite(number) or (self.type is int and number != int(number)):
+                return None
+            return int(value) if self.type is int and isinstance(value, str) and "e" not in value.lower() else (
+                self.type(number))
+        except (ValueError, OverflowError):
+            return None
+
+    def _allowed(self, value: object) -> bool:
+        if self.choices:
+            return value in self.choices
+        if self.minimum is not None and value < self.minimum:
+            return False
+        return self.maximum is None or value <= self.maximum
+
+    @property
+    def expected(self) -> str:
+        """Type, range and unit in words."""
+        if self.choices:
+            return "one of " + ", ".join(map(str, self.choices))
+        return " ".join(part for part in (_KIND[self.type], self.range, self.unit) if part)
+
+    @property
+    def range(self) -> str:
+        """The allowed interval, '' where there is none."""
+        low, high = self.minimum, self.maximum
+        if low is not None and high is not None:
+            return f"{low:g} .. {high:g}"
+        return f">= {low:g}" if low is not None else f"<= {high:g}" if high is not None else ""
+
+
+@dataclass(frozen=True)
+class Output:
+    """A file of a stage's folder, or many by a pattern (`frames/*.png` or `frames/%06d.png`).
+
+    volatile: holds times or the like, so its bytes say nothing about the result: listed, never hashed.
+    optional: may be absent. unit, space, colour_space: go into the manifest.
+    """
+
+    path: str
+    help: str
+    unit: str = ""
+    space: str = ""
+    colour_space: str = ""
+    volatile: bool = False
+    optional: bool = False
+
+    def matches(self, relative: str) -> bool:
+        """Whether the file (posix path inside the stage's folder) is this output."""
+        pattern = PurePosixPath(_COUNTER.sub("*", self.path)).parts
+        parts = PurePosixPath(relative).parts
+        return len(parts) == len(pattern) and all(map(fnmatchcase, parts, pattern))
+
+
+def folder_of(name: str) -> str:
+    """Where the stage of this name publishes, relative to the run's folder."""
+    return "export" if name.startswith("export_") else f"work/{name}"
+
+
+SEED = Parameter("seed", int, 0, "Seed of every random choice in the stage.", "", 0, 2**31 - 1)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Declaration of one stage. `seed` is added to the parameters of each.
+
+    inputs: stages whose folders are read. A stage without inputs reads the subject's video. A stage named export_*
+    publishes to `export/`, all others to `work/<name>/`.
+    """
+
+    name: str
+    version: int
+    help: str
+    inputs: tuple[str, ...]
+    outputs: tuple[Output, ...]
+    parameters: tuple[Parameter, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "inputs", tuple(self.inputs))
+        object.__setattr__(self, "outputs", tuple(self.outputs))
+        parameters = tuple(self.parameters)
+        if all(p.name != SEED.name for p in parameters):
+            parameters += (SEED,)
+        object.__setattr__(self, "parameters", parameters)
+        names = [p.name for p in parameters]
+        if not _NAME.match(self.name) or not self.help or not self.outputs or len(set(names)) != len(names):
+            raise ValueError(f"stage {self.name!r} needs a snake_case name, a sentence, outputs, unique parameters")
+
+    @property
+    def reads_source(self) -> bool:
+        """Whether the stage reads the subject's video itself."""
+        return not self.inputs
+
+    @property
+    def folder(self) -> str:
+        """Where the stage publishes, relative to the run's folder."""
+        return folder_of(self.name)
+
+    def defaults(self) -> dict[str, object]:
+        """{parameter: default}."""
+        return {p.name: p.default for p in self.parameters}
+
+    def parse(self, values: Mapping[str, object], where: str) -> dict[str, object]:
+        """Given values, checked and typed; InputError for the first that is unknown, of a wrong type or out of range.
+
+        where: what the values come from, in words; the parameter's name is added.
+        """
+        known = {p.name: p for p in self.parameters}
+        for name in values:
+            if name not in known:
+                raise unknown_name("parameter", f"{self.name}.{name}", [f"{self.name}.{key}" for key in known], where)
+        return {name: known[name].parse(value, f"{where}: {self.name}.{name}") for name, value in values.items()}
+
+    def output_of(self, relative: str) -> Output | None:
+        """The declared output that a file of the folder belongs to."""
+        return next((output for output in self.outputs if output.matches(relative)), None)
+
+
+def parameter_table(stages: Sequence[Stage]) -> str:
+    """Markdown table of all parameters, for the README."""
+    rows = ["| stage | parameter | default | range | unit | what |", "|---|---|---|---|---|---|"]
+    for stage in stages:
+        for p in stage.parameters:
+            allowed = ", ".join(f"`{c}`" for c in p.choices) or p.range
+            default = "none" if p.default is None else str(p.default).lower() if p.type is bool else p.default
+            rows.append(f"| {stage.name} | `{p.name}` | `{default}` | {allowed} | {p.unit} | {p.help} |")
+    return "\n".join(rows) + "\n"

@@ -1,0 +1,107 @@
+"""Does a stage's work in a temporary folder, checks it, describes it and publishes it."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from shared.contract.currency import input_hashes, work_to_do
+from shared.contract.hashing import HashMemory
+from shared.contract.job import Job
+from shared.contract.manifest import LOG, MANIFEST, PROVENANCE, Work, output_entries, write_record
+from shared.contract.pipeline import REPOSITORY
+from shared.contract.progress import Reporter
+from shared.contract.provenance import Meter, environment
+from shared.contract.source import loaded_code
+from shared.errors import InputError, LimnError
+
+if TYPE_CHECKING:
+    from shared.contract.cli import Request
+
+_LAST_LINES = 12
+
+
+def execute(request: Request, run: Callable[[Job], None], check: Callable[[Job], None] | None) -> int:
+    """0 when the folder is published; 1 when the stage failed, its log is kept then. InputError leaves nothing."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    name, folders = request.stage.name, request.run
+    memory = HashMemory(folders.memory, request.verify)
+    work = work_to_do(request.stage, request.subject, folders, request.parameters, memory)
+    temporary = folders.temporary(name)
+    reporter = Reporter(name, temporary / LOG, request.events)
+    try:
+        reporter.event("started")
+        seconds = _do(request, work, run, check, temporary, reporter, memory)
+    except InputError:
+        reporter.close()
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    except KeyboardInterrupt:
+        reporter.close()
+        shutil.rmtree(temporary, ignore_errors=True)
+        sys.stderr.write(f"{name}: interrupted\n")
+        return 1
+    except Exception as error:
+        return _failed(request, temporary, reporter, error)
+    reporter.event("done", seconds=seconds)
+    if not request.events:
+        sys.stderr.write(f"{name}: done in {seconds:.1f} s: {folders.published(name)}\n")
+    return 0
+
+
+def _do(request: Request, work: Work, run: Callable[[Job], None], check: Callable[[Job], None] | None,
+        temporary: Path, reporter: Reporter, memory: HashMemory) -> float:
+    """Runs, checks, publishes; returns the wall seconds."""
+    stage, folders = request.stage, request.run
+    inputs = {name: folders.published(name) for name in stage.inputs}
+    job = Job(stage, request.subject, request.parameters, temporary, folders, inputs, reporter, request.threads)
+    meter = Meter()
+    try:
+        run(job)
+        if check:
+            check(job)
+    finally:
+        cost = meter.stop()
+    if input_hashes(stage, request.subject, folders, HashMemory(folders.memory)) != work.inputs:
+        raise LimnError(f"{stage.name}: an input changed while the stage ran; run it again")
+    entries = output_entries(stage, temporary)
+    write_record(temporary / MANIFEST, {**work.content(), "key": work.key, "outputs": entries})
+    size = sum(path.stat().st_size for path in temporary.rglob("*") if path.is_file())
+    provenance = {**cost, **environment(), "code": loaded_code(REPOSITORY), "threads": request.threads,
+                  "warnings": reporter.warnings, "bytes": size}
+    write_record(temporary / PROVENANCE, provenance)
+    reporter.write_log(f"done in {cost['wall_s']} s, peak memory {cost['peak_memory_mb']} MB")
+    reporter.close()
+    folders.publish(temporary, stage.name)
+    published = folders.published(stage.name)
+    for name, entry in entries.items():
+        if "sha256" in entry:
+            memory.learn(published / name, entry["sha256"])
+    memory.save()
+    folders.write_stamp(stage.name)
+    return cost["wall_s"]
+
+
+def _failed(request: Request, temporary: Path, reporter: Reporter, error: Exception) -> int:
+    """Keeps the log with the trace and says where it is."""
+    name = request.stage.name
+    reporter.write_log(traceback.format_exc())
+    reporter.close()
+    log = request.run.keep_failed(temporary, name)
+    message = " ".join(str(error).split()) or "no message"
+    if not isinstance(error, LimnError):
+        message = f"{type(error).__name__}: {message}"
+    last = log.read_text(encoding="utf-8").splitlines()[-_LAST_LINES:]
+    reporter.event("failed", message=message, log=str(log), last=last)
+    sys.stderr.write("\n".join([*last, f"{name}: failed: {message}", f"{name}: the whole log: {log}"]) + "\n")
+    return 1
+
+
+def _interrupt(_signal: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

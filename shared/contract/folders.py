@@ -1,0 +1,153 @@
+"""Where a run lies on disk, and how a stage's folder appears there: complete or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from shared.contract.declare import folder_of
+from shared.contract.manifest import LOG, outputs_digest, read_manifest
+from shared.errors import InputError
+
+
+class RunFolder:
+    """The folder that holds one subject's `work/` and `export/`."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.work = root / "work"
+
+    @classmethod
+    def of(cls, folder: Path, name: str, out: Path | None) -> RunFolder:
+        """The subject's own folder, or out/<name of the subject>."""
+        return cls(Path(os.path.abspath(out)) / name if out else folder)
+
+    def published(self, name: str) -> Path:
+        """The stage's folder."""
+        return self.root / folder_of(name)
+
+    def stamp(self, name: str) -> Path:
+        """The file that Snakemake watches; it holds the digest of the stage's outputs."""
+        return self.work / f"{name}.stamp"
+
+    def failed(self, name: str) -> Path:
+        """Where the log of a failed stage stays."""
+        return self.work / f"{name}.failed"
+
+    @property
+    def memory(self) -> Path:
+        """Remembered file hashes."""
+        return self.work / ".hashes.json"
+
+    def temporary(self, name: str) -> Path:
+        """A fresh folder beside the stage's, for the process to write into."""
+        path = self.work / f".{name}.tmp-{os.getpid()}"
+        try:
+            path.mkdir(parents=True)
+        except OSError as error:
+            raise InputError("cannot write here", where=str(self.work), got=error.strerror,
+                             mend="write elsewhere with --out DIR") from error
+        return path
+
+    def publish(self, temporary: Path, name: str) -> None:
+        """Renames the finished folder into place; a folder of an earlier run is moved aside first, then removed."""
+        target = self.published(name)
+        old = self.work / f".{name}.old-{os.getpid()}"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):
+            target.rename(old)
+        temporary.rename(target)
+        shutil.rmtree(old, ignore_errors=True)
+        shutil.rmtree(self.failed(name), ignore_errors=True)
+
+    def write_stamp(self, name: str) -> None:
+        """Writes the stamp of the published folder."""
+        manifest = read_manifest(self.published(name))
+        if manifest is None:
+            raise FileNotFoundError(self.published(name) / "manifest.json")
+        stamp = self.stamp(name)
+        temporary = stamp.with_name(f".{stamp.name}.{os.getpid()}")
+        temporary.write_text(outputs_digest(manifest) + "\n", encoding="utf-8")
+        temporary.replace(stamp)
+
+    def keep_failed(self, temporary: Path, name: str) -> Path:
+        """Keeps the log of a failed stage and drops the rest; returns the log's path."""
+        failed = self.failed(name)
+        shutil.rmtree(failed, ignore_errors=True)
+        failed.mkdir(parents=True)
+        log = failed / LOG
+        (temporary / LOG).rename(log)
+        shutil.rmtree(temporary, ignore_errors=True)
+        return log
+
+    def leftovers(self, name: str) -> list[Path]:
+        """What killed processes left of the stage. Only the holder of the stage's lock may remove it."""
+        return [path for kind in ("tmp", "old") for path in self.work.glob(f".{name}.{kind}-*")]
+
+    def remove_leftovers(self, name: str) -> None:
+        """Removes what killed processes left of the stage."""
+        for path in self.leftovers(name):
+            shutil.rmtree(path, ignore_errors=True)
+
+    @contextlib.contextmanager
+    def locked(self, name: str, wait_s: float = 0.0) -> Iterator[None]:
+        """Holds `work/.<name>.lock`. InputError where another living process holds it for longer than wait_s.
+
+        The kernel releases the lock with its process, so a killed run never leaves a stale one. Folders in which
+        nothing lies in the end are removed.
+        """
+        path = self.work / f".{name}.lock"
+        added = [folder for folder in self.root.parents if not folder.exists()]
+        file = _acquire(path, time.monotonic() + wait_s)
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+            os.close(file)
+            with contextlib.suppress(OSError):
+                for folder in (self.work, self.root, *added):
+                    folder.rmdir()
+
+
+def _acquire(path: Path, deadline: float) -> int:
+    """File descriptor of the lock, held; its file holds the process id."""
+    while True:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise InputError("cannot write here", where=str(path.parent), got=error.strerror,
+                             mend="write elsewhere with --out DIR") from error
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            owner = os.read(file, 32).decode(errors="replace").strip()
+            os.close(file)
+            if error.errno not in (errno.EACCES, errno.EAGAIN):
+                raise
+            if time.monotonic() > deadline:
+                raise InputError("another process works here", where=str(path.parent), got=f"process {owner or '?'}",
+                                 mend="wait for it or end it") from error
+            time.sleep(0.05)
+            continue
+        if _is_same_file(path, file):
+            os.ftruncate(file, 0)
+            os.write(file, f"{os.getpid()}\n".encode())
+            return file
+        os.close(file)
+
+
+def _is_same_file(path: Path, file: int) -> bool:
+    """Whether the path still leads to the opened file (a releasing process removes it)."""
+    try:
+        return os.stat(path).st_ino == os.fstat(file).st_ino
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,74 @@
+"""Content hashes of files, remembered by size and time of change so that unchanged files are not read again."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from pathlib import Path
+
+_BLOCK = 1 << 22
+
+
+def canonical_json(value: object) -> str:
+    """JSON of one spelling: sorted keys, no spaces."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def hash_value(value: object) -> str:
+    """SHA-256 of a JSON value."""
+    return hashlib.sha256(canonical_json(value).encode()).hexdigest()
+
+
+def hash_file(path: Path) -> str:
+    """SHA-256 of a file's bytes; memory does not grow with the file."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+class HashMemory:
+    """SHA-256 of files under one folder and of the source, kept in `path` between calls.
+
+    It only saves time: an entry counts while the file's size and time of change are the recorded ones, and a memory
+    that is lost or damaged is built again.
+    """
+
+    def __init__(self, path: Path, verify: bool = False) -> None:
+        """verify: read every file again, whatever is remembered."""
+        self.path, self.verify, self._changed = path, verify, False
+        self._known: dict[str, list] = {}
+        with contextlib.suppress(OSError, ValueError):
+            known = json.loads(path.read_text(encoding="utf-8"))
+            self._known = known if isinstance(known, dict) else {}
+
+    def hash(self, path: Path) -> str:
+        """SHA-256 of the file's content."""
+        stat = path.stat()
+        key, state = self._key(path), [stat.st_size, stat.st_mtime_ns]
+        known = self._known.get(key)
+        if not self.verify and isinstance(known, list) and len(known) == 3 and known[:2] == state:
+            return known[2]
+        digest = hash_file(path)
+        self._known[key], self._changed = [*state, digest], True
+        return digest
+
+    def learn(self, path: Path, digest: str) -> None:
+        """Remembers a hash that was computed elsewhere."""
+        stat = path.stat()
+        self._known[self._key(path)], self._changed = [stat.st_size, stat.st_mtime_ns, digest], True
+
+    def save(self) -> None:
+        """Writes what was learnt, where the folder exists and can be written."""
+        if not self._changed or not self.path.parent.is_dir():
+            return
+        temporary = self.path.with_name(f"{self.path.name}.{os.getpid()}")
+        with contextlib.suppress(OSError):
+            temporary.write_text(canonical_json(self._known), encoding="utf-8")
+            temporary.replace(self.path)
+
+    def _key(self, path: Path) -> str:
+        return os.path.relpath(path, self.path.parent)

@@ -1,0 +1,80 @@
+"""What a stage's run and check receive."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from shared.contract.declare import Stage
+from shared.contract.folders import RunFolder
+from shared.contract.manifest import PROVENANCE, read_manifest, read_record
+from shared.contract.progress import Reporter
+from shared.contract.subject import Subject
+from shared.errors import InputError, LimnError
+
+Item = TypeVar("Item")
+
+
+class Parameters:
+    """The stage's parameters as attributes; they cannot be changed."""
+
+    def __init__(self, values: Mapping[str, object]) -> None:
+        self.__dict__.update(values)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError(f"parameters are fixed: {name}")
+
+    def __repr__(self) -> str:
+        return f"Parameters({self.__dict__})"
+
+    def as_dict(self) -> dict[str, object]:
+        """{name: value}, the seed included."""
+        return dict(self.__dict__)
+
+
+class Job:
+    """One run of one stage.
+
+    subject: facts of subject.yaml. params: the stage's parameters, `seed` included. out: the folder to write into; it
+    is published when run and check have returned. threads: cores the stage may use.
+    """
+
+    def __init__(self, stage: Stage, subject: Subject, params: Mapping[str, object], out: Path, run: RunFolder,
+                 folders: Mapping[str, Path], reporter: Reporter, threads: int) -> None:
+        """folders: {stage: published folder} of the declared inputs."""
+        self.stage, self.subject, self.params, self.out = stage, subject, Parameters(params), out
+        self.threads = threads
+        self._run, self._folders, self._reporter = run, dict(folders), reporter
+
+    def input(self, stage: str) -> Path:
+        """The published folder of a declared input."""
+        if stage not in self._folders:
+            raise LimnError(f"{self.stage.name} does not declare the input {stage!r}")
+        return self._folders[stage]
+
+    def manifest(self, stage: str) -> dict:
+        """manifest.json of a declared input."""
+        return _present(read_manifest(self.input(stage)), self.input(stage))
+
+    def provenance(self, stage: str) -> dict:
+        """provenance.json of a declared input. For volatile outputs only: it is no part of the stage's key."""
+        return _present(read_record(self.input(stage) / PROVENANCE), self.input(stage))
+
+    def progress(self, iterable: Iterable[Item], label: str, total: int | None = None) -> Iterator[Item]:
+        """The items, with a bar on a terminal and plain lines elsewhere."""
+        return self._reporter.track(iterable, label, total)
+
+    def note(self, text: str) -> None:
+        """A line for the log."""
+        self._reporter.note(text)
+
+    def warn(self, text: str) -> None:
+        """A warning: it stays in provenance.json and is shown at the end of the run."""
+        self._reporter.warn(text)
+
+
+def _present(record: dict | None, folder: Path) -> dict:
+    if record is None:
+        raise InputError("the stage's record is missing or damaged", where=str(folder), mend="run limn run again")
+    return record

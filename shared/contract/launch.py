@@ -1,0 +1,58 @@
+"""Starts a stage for the workflow: `python -m shared.contract.launch FOLDER PACKAGE NAME [stage arguments]`.
+
+Ties the process to its parent, so that a stage never outlives a killed workflow; answers at once where the stage's
+result is current, without loading what the stage needs; else becomes `python -m PACKAGE.NAME`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+from pathlib import Path
+
+from shared.contract.cli import answer_current, parse_request, report_input_error, set_threads
+from shared.contract.pipeline import REPOSITORY
+from shared.contract.source import read_declaration
+from shared.errors import InputError
+
+_SET_PARENT_DEATH_SIGNAL = 1
+
+
+def tie_to_parent() -> None:
+    """The kernel kills this process when its parent dies (Linux; kept across exec).
+
+    LIMN_PARENT, the parent's process id, tells whether it died before this call.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+    if os.environ.get("LIMN_PARENT", str(os.getppid())) != str(os.getppid()):
+        raise SystemExit(1)
+
+
+def main() -> int:
+    """0 where the stage is current, 2 where the input is at fault; otherwise it does not return."""
+    tie_to_parent()
+    folder, package, name, *arguments = sys.argv[1:]
+    stage = read_declaration(Path(folder).joinpath(*package.split("."), f"{name}.py"))
+    try:
+        request = parse_request(stage, arguments)
+    except InputError as error:
+        report_input_error(name, error, None)
+        return 2
+    try:
+        if answer_current(request):
+            return 0
+    except InputError as error:
+        report_input_error(name, error, request.events)
+        return 2
+    set_threads(request.threads)
+    os.environ["PYTHONHASHSEED"] = "0"
+    search = [folder, str(REPOSITORY), os.environ.get("PYTHONPATH", "")]
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, search))
+    os.execv(sys.executable, [sys.executable, "-m", f"{package}.{name}", *arguments])
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,152 @@
+"""manifest.json: what a stage was told, what it read and what it made. Content only: same work, same bytes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from shared.contract.declare import Stage
+from shared.contract.hashing import HashMemory, hash_file, hash_value
+from shared.contract.shapes import describe
+from shared.contract.subject import Subject
+from shared.errors import LimnError
+
+SCHEMA = 1
+MANIFEST, PROVENANCE, LOG = "manifest.json", "provenance.json", "log.txt"
+RECORDS = (MANIFEST, PROVENANCE, LOG)
+SUBJECT_INPUT, VIDEO_INPUT = "subject.yaml", "video"
+
+
+@dataclass(frozen=True)
+class Work:
+    """One stage's work, fully determined: the same Work gives the same bytes.
+
+    parameters: without the seed. inputs: {name: SHA-256}; of stages the digest of their outputs; None where a stage has
+    yet to run.
+    """
+
+    stage: str
+    version: int
+    parameters: Mapping[str, object]
+    seed: int
+    inputs: Mapping[str, str | None]
+
+    def content(self) -> dict[str, object]:
+        """The manifest's part that is known before the work is done."""
+        return {"schema": SCHEMA, "stage": self.stage, "version": self.version, "parameters": dict(self.parameters),
+                "seed": self.seed, "inputs": dict(self.inputs)}
+
+    @property
+    def key(self) -> str:
+        """SHA-256 of the content."""
+        return hash_value(self.content())
+
+    def reasons(self, manifest: Mapping[str, object] | None) -> list[str]:
+        """Why a folder with this manifest is not the result of this work; empty where it is.
+
+        Inputs that are not known yet (None) give no reason.
+        """
+        if manifest is None:
+            return ["never ran"]
+        if manifest.get("schema") != SCHEMA:
+            return ["made by another version of Limn"]
+        reasons = []
+        if manifest["version"] != self.version:
+            reasons.append(f"stage version {manifest['version']} -> {self.version}")
+        before = {**manifest["parameters"], "seed": manifest["seed"]}
+        now = {**self.parameters, "seed": self.seed}
+        reasons += [f"parameter {name}: {_before(before, name)} -> {_before(now, name)}"
+                    for name in sorted({*before, *now}) if _before(before, name) != _before(now, name)]
+        read = manifest["inputs"]
+        reasons += [f"input {name} changed" for name in sorted({*read, *self.inputs})
+                    if read.get(name) != self.inputs.get(name) and self.inputs.get(name, "") is not None]
+        return reasons
+
+
+def _before(values: Mapping[str, object], name: str) -> str:
+    return json.dumps(values[name]) if name in values else "absent"
+
+
+def make_work(stage: Stage, parameters: Mapping[str, object], inputs: Mapping[str, str | None]) -> Work:
+    """The work that a stage is to do."""
+    rest = {name: value for name, value in parameters.items() if name != "seed"}
+    return Work(stage.name, stage.version, rest, int(parameters["seed"]), inputs)
+
+
+def source_inputs(stage: Stage, subject: Subject, memory: HashMemory) -> dict[str, str]:
+    """{name: SHA-256} of what the stage reads of the subject itself: its settings and, of the first stage, the clip."""
+    inputs = {SUBJECT_INPUT: hash_value(subject.content())}
+    if stage.reads_source:
+        files = [[path.name, memory.hash(path)] for path in subject.video_files()]
+        inputs[VIDEO_INPUT] = hash_value([subject.video_name(), files])
+    return inputs
+
+
+def outputs_digest(manifest: Mapping[str, object]) -> str:
+    """SHA-256 over the names and hashes of all outputs: what later stages depend on."""
+    return hash_value({name: entry.get("sha256", "") for name, entry in manifest["outputs"].items()
+                       if not entry.get("volatile")})
+
+
+def output_entries(stage: Stage, folder: Path) -> dict[str, dict[str, object]]:
+    """{file: entry} of all that the stage wrote; LimnError for a file nobody declared or an output that is missing."""
+    entries = {}
+    files = sorted(path for path in folder.rglob("*") if not path.is_dir())
+    names = [path.relative_to(folder).as_posix() for path in files]
+    for path, name in zip(files, names, strict=True):
+        if name in RECORDS:
+            continue
+        output = stage.output_of(name)
+        if output is None:
+            raise LimnError(f"{stage.name}: wrote {name}, which is not among its declared outputs")
+        entry: dict[str, object] = {"volatile": True} if output.volatile else {
+            "sha256": hash_file(path), "bytes": path.stat().st_size}
+        if not output.volatile:
+            entry |= describe(path)
+        described = {"unit": output.unit, "space": output.space, "colour_space": output.colour_space}
+        entries[name] = entry | {key: value for key, value in described.items() if value}
+    missing = [o.path for o in stage.outputs if not o.optional and not any(o.matches(name) for name in entries)]
+    if missing:
+        raise LimnError(f"{stage.name}: did not write {', '.join(missing)} (declare optional=True what may be absent)")
+    return entries
+
+
+def read_record(path: Path) -> dict | None:
+    """A manifest or provenance; None where it is absent or not readable as one."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return record if isinstance(record, dict) else None
+
+
+def read_manifest(folder: Path) -> dict | None:
+    """The folder's manifest; None where it is absent or damaged."""
+    manifest = read_record(folder / MANIFEST)
+    needed = ("schema", "stage", "version", "parameters", "seed", "inputs", "outputs")
+    return manifest if manifest and all(name in manifest for name in needed) else None
+
+
+def write_record(path: Path, record: Mapping[str, object]) -> None:
+    """JSON with sorted keys, one spelling of the same content."""
+    path.write_text(json.dumps(record, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _is_sound(path: Path, entry: Mapping[str, object], memory: HashMemory) -> bool:
+    return path.stat().st_size == entry["bytes"] and memory.hash(path) == entry["sha256"]
+
+
+def damage(folder: Path, manifest: Mapping[str, object], memory: HashMemory) -> list[str]:
+    """What is wrong with the published files: missing, or no longer what the manifest says."""
+    faults = []
+    for name, entry in manifest["outputs"].items():
+        path = folder / name
+        if not path.is_file():
+            faults.append(f"file {name} is missing")
+        elif not entry.get("volatile") and not _is_sound(path, entry, memory):
+            faults.append(f"file {name} is damaged")
+    if len(faults) > 2:
+        faults[2:] = [f"{len(faults) - 2} more files missing or damaged"]
+    return faults

@@ -1,0 +1,156 @@
+"""pipeline.yaml: which stages there are, what they need, and the presets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+from shared.contract.declare import Parameter, Stage
+from shared.contract.source import read_declaration
+from shared.contract.wording import check_keys, nearest, read_yaml, unknown_name
+from shared.errors import InputError
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+DEFAULT_PIPELINE = REPOSITORY / "pipeline.yaml"
+_THREADS = Parameter("threads", int, None, "Cores of one job.", "cores", 1, 4096)
+_RESOURCE = Parameter("resource", int, 1, "What a cluster books for one job.", "", 1)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A stage as pipeline.yaml places it. threads: None for all cores. resources: mem_mb, runtime (minutes)."""
+
+    needs: tuple[str, ...]
+    threads: int | None = None
+    resources: Mapping[str, int] = field(default_factory=dict)
+    parameters: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """The content of pipeline.yaml. steps are in an order in which each follows what it needs."""
+
+    path: Path
+    package: str
+    steps: Mapping[str, Step]
+    presets: Mapping[str, Mapping[str, Mapping[str, object]]]
+    default_preset: str
+
+    @cached_property
+    def root(self) -> Path:
+        """The folder that holds the stages' package: beside pipeline.yaml, else the repository."""
+        own = self.path.parent.joinpath(*self.package.split("."))
+        return self.path.parent if own.is_dir() else REPOSITORY
+
+    @cached_property
+    def stages(self) -> dict[str, Stage]:
+        """The declarations, checked against the steps."""
+        declared = {name: read_declaration(self.stage_file(name)) for name in self.steps}
+        for name, stage in declared.items():
+            if set(stage.inputs) != set(self.steps[name].needs):
+                raise InputError("needs differ from what the stage declares", where=f"{self.path}: stages.{name}",
+                                 got=list(self.steps[name].needs), expected=list(stage.inputs))
+        folders = [stage.folder for stage in declared.values()]
+        if len(set(folders)) != len(folders):
+            raise InputError("more than one stage publishes to export/", where=str(self.path))
+        return declared
+
+    def stage_file(self, name: str) -> Path:
+        """The stage's source file."""
+        return self.root.joinpath(*self.package.split("."), f"{name}.py")
+
+    def parameters(self, stage: Stage, preset: str | None, given: Mapping[str, object]) -> dict[str, object]:
+        """All parameters of the stage: defaults, then its step's, then the preset's, then the given ones."""
+        preset = preset or self.default_preset
+        if preset not in self.presets:
+            raise unknown_name("preset", preset, self.presets, str(self.path))
+        step = self.steps.get(stage.name)
+        where = f"{self.path}: stages.{stage.name}.parameters"
+        values = stage.defaults() | stage.parse(step.parameters if step else {}, where)
+        values |= stage.parse(self.presets[preset].get(stage.name, {}), f"{self.path}: presets.{preset}")
+        return values | stage.parse(given, "--set")
+
+    def check(self) -> None:
+        """Every stage's declaration and every value of every preset; InputError for the first that is wrong."""
+        for preset in self.presets:
+            for stage in self.stages.values():
+                self.parameters(stage, preset, {})
+
+
+def load_pipeline(path: Path | None = None) -> Pipeline:
+    """Reads pipeline.yaml (the repository's by default) and checks its structure; InputError where it is wrong."""
+    path = Path(path).absolute() if path else DEFAULT_PIPELINE
+    if not path.is_file():
+        raise InputError("no such file", where=str(path), mend="give the pipeline with --pipeline FILE")
+    content = check_keys(read_yaml(path), ("package", "stages", "presets", "default_preset"), str(path))
+    given = check_keys(content.get("stages"), _Anything(), f"{path}: stages")
+    steps = {str(name): _step(value, f"{path}: stages.{name}") for name, value in given.items()}
+    if not steps:
+        raise InputError("no stages", where=str(path))
+    steps = _in_order(steps, path)
+    presets = check_keys(content.get("presets"), _Anything(), f"{path}: presets")
+    presets = {str(name): _preset(value, steps, f"{path}: presets.{name}") for name, value in presets.items()}
+    default = str(content.get("default_preset", "standard"))
+    presets = presets or {default: {}}
+    if default not in presets:
+        raise unknown_name("preset", default, presets, f"{path}: default_preset")
+    return Pipeline(path, str(content.get("package", "stages")), steps, presets, default)
+
+
+class _Anything:
+    """A collection that holds every key: for mappings whose keys are names that the file itself gives."""
+
+    def __contains__(self, key: object) -> bool:
+        return True
+
+
+def _step(value: object, where: str) -> Step:
+    given = check_keys(value, ("needs", "threads", "resources", "parameters"), where)
+    needs = given.get("needs") or []
+    if not isinstance(needs, list):
+        raise InputError("not a list of stages", where=f"{where}.needs", got=repr(needs))
+    resources = check_keys(given.get("resources"), ("mem_mb", "runtime", "disk_mb"), f"{where}.resources")
+    booked = {name: _RESOURCE.parse(amount, f"{where}.resources.{name}") for name, amount in resources.items()}
+    threads = _THREADS.parse(given.get("threads"), f"{where}.threads")
+    parameters = check_keys(given.get("parameters"), _Anything(), f"{where}.parameters")
+    return Step(tuple(map(str, needs)), threads, booked, parameters)
+
+
+def _in_order(steps: Mapping[str, Step], path: Path) -> dict[str, Step]:
+    for name, step in steps.items():
+        for need in step.needs:
+            if need not in steps:
+                raise unknown_name("stage", need, steps, f"{path}: stages.{name}.needs")
+    try:
+        order = tuple(TopologicalSorter({name: step.needs for name, step in steps.items()}).static_order())
+    except CycleError as error:
+        circle = " -> ".join(error.args[1])
+        raise InputError("stages need each other in a circle", where=str(path), got=circle) from error
+    return {name: steps[name] for name in order}
+
+
+def _preset(value: object, steps: Mapping[str, Step], where: str) -> dict[str, Mapping[str, object]]:
+    given = check_keys(value, _Anything(), where)
+    for name in given:
+        if name not in steps:
+            raise unknown_name("stage", name, steps, where)
+    return {name: check_keys(settings, _Anything(), f"{where}.{name}") for name, settings in given.items()}
+
+
+def split_settings(settings: Iterable[str], stages: Iterable[str], where: str = "--set") -> dict[str, dict[str, str]]:
+    """['stage.key=value', ...] -> {stage: {key: value}}; InputError for what is not of that form."""
+    stages = tuple(stages)
+    values: dict[str, dict[str, str]] = {}
+    for setting in settings:
+        name, equals, value = setting.partition("=")
+        stage, dot, key = name.strip().partition(".")
+        if not equals or not dot or not key:
+            raise InputError("setting not understood", where=where, got=setting, expected="stage.key=value",
+                             mend="" if dot else f"stages: {', '.join(stages)}")
+        if stage not in stages:
+            raise InputError(f"unknown stage {stage!r}", where=where, mend=nearest(stage, stages))
+        values.setdefault(stage, {})[key] = value.strip()
+    return values

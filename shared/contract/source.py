@@ -1,0 +1,81 @@
+"""Reads a stage's declaration from its file without importing what the stage imports.
+
+Planning must answer in a second although the stages themselves load torch, OpenCV and pycolmap. Only the statement
+`STAGE = Stage(...)`, the file's own constants that it uses and imports from shared.contract are evaluated.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import sys
+from pathlib import Path
+
+from shared.contract.declare import Stage
+from shared.errors import InputError, LimnError
+
+_DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def read_declaration(path: Path) -> Stage:
+    """The STAGE of a stage file; InputError where there is no such file or it declares nothing."""
+    if not path.is_file():
+        raise InputError("no such stage", where=str(path), mend="correct 'stages' in pipeline.yaml")
+    tree = ast.parse(path.read_bytes(), filename=str(path))
+    assigned = {target.id: node for node in tree.body for target in _targets(node)}
+    if "STAGE" not in assigned:
+        raise InputError("declares no STAGE = Stage(...)", where=str(path))
+    needed = _needed_names(assigned, "STAGE")
+    statements = [node for node in tree.body if _is_contract_import(node) or needed & {t.id for t in _targets(node)}]
+    namespace: dict[str, object] = {}
+    try:
+        exec(compile(ast.Module(statements, type_ignores=[]), str(path), "exec"), namespace)
+    except NameError as error:
+        raise LimnError(f"{path}: STAGE uses {error.name}, which is neither a constant of the file nor of "
+                        "shared.contract") from error
+    stage = namespace["STAGE"]
+    if not isinstance(stage, Stage) or stage.name != path.stem:
+        raise LimnError(f"{path}: STAGE is not a Stage named {path.stem!r}")
+    return stage
+
+
+def loaded_code(folder: Path) -> dict[str, str]:
+    """{file relative to folder: fingerprint} of the modules loaded from there, this package excepted."""
+    files = {Path(module.__file__) for module in list(sys.modules.values()) if getattr(module, "__file__", None)}
+    inside = sorted(path for path in files if path.is_relative_to(folder) and path.suffix == ".py")
+    names = [path.relative_to(folder).as_posix() for path in inside]
+    return {name: fingerprint(folder / name) for name in names if not name.startswith((".", "shared/contract/"))}
+
+
+def fingerprint(path: Path) -> str:
+    """SHA-256 of the file's code without comments, layout and docstrings.
+
+    Advisory: a stage runs again when its version changes, not when this does; planning points out the difference.
+    """
+    tree = ast.parse(path.read_bytes())
+    for node in ast.walk(tree):
+        if isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
+            del node.body[0]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+
+
+def _targets(node: ast.stmt) -> list[ast.Name]:
+    targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+    flat = [part for target in targets for part in (target.elts if isinstance(target, ast.Tuple) else [target])]
+    return [target for target in flat if isinstance(target, ast.Name)]
+
+
+def _needed_names(assigned: dict[str, ast.stmt], name: str) -> set[str]:
+    """Names of the file's own constants that `name` depends on, itself included."""
+    needed, waiting = set(), [name]
+    while waiting:
+        current = waiting.pop()
+        if current in needed or current not in assigned:
+            continue
+        needed.add(current)
+        waiting += [node.id for node in ast.walk(assigned[current]) if isinstance(node, ast.Name)]
+    return needed
+
+
+def _is_contract_import(node: ast.stmt) -> bool:
+    return isinstance(node, ast.ImportFrom) and node.module is not None and node.module.startswith("shared.contract")

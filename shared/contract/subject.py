@@ -1,0 +1,136 @@
+"""A subject: the folder with the clip and subject.yaml."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from shared.contract.declare import Parameter
+from shared.contract.wording import check_keys, nearest, read_yaml
+from shared.errors import InputError
+
+TRANSFERS = ("srgb", "bt709", "linear")
+MOVES = ("head", "camera")
+_COUNTER = re.compile(r"%(?:0?(\d+))?d")
+_CAMERA = (
+    Parameter("focal_length_mm", float, None, "Focal length of the lens.", "mm", 1.0, 5000.0),
+    Parameter("sensor_width_mm", float, None, "Width of the sensor's used part.", "mm", 1.0, 500.0),
+    Parameter("focal_length_px", float, None, "Focal length in pixels of the source frame.", "px", 10.0, 1e6),
+)
+_NEW = "make a subject with: limn new CLIP"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Facts of subject.yaml. video: absolute path of the file, or of an image sequence with a counter (%05d).
+
+    focal_length_px: of the source frame; None with focal_length_mm also None means: estimate it.
+    """
+
+    folder: Path
+    name: str
+    video: Path
+    focal_length_px: float | None = None
+    focal_length_mm: float | None = None
+    sensor_width_mm: float | None = None
+    transfer: str = "srgb"
+    moves: str = "head"
+
+    def content(self) -> dict[str, object]:
+        """All that subject.yaml says besides the video, independent of where the folder lies."""
+        keys = ("focal_length_px", "focal_length_mm", "sensor_width_mm", "transfer", "moves")
+        return {key: getattr(self, key) for key in keys}
+
+    def video_name(self) -> str:
+        """The video's path inside the folder."""
+        return self.video.relative_to(self.folder).as_posix()
+
+    def video_files(self) -> list[Path]:
+        """The file, or the files of the image sequence in order; empty where there is none."""
+        if not is_sequence(self.video.name):
+            return [self.video] if self.video.is_file() else []
+        pattern = re.compile(_number_pattern(self.video.name))
+        numbered = [(pattern.fullmatch(path.name), path) for path in _listing(self.video.parent)]
+        return [path for _, path in sorted((int(m.group(1)), path) for m, path in numbered if m)]
+
+
+def is_sequence(name: str) -> bool:
+    """Whether a file name holds a printf counter."""
+    return _COUNTER.search(name) is not None
+
+
+def _number_pattern(name: str) -> str:
+    counter = _COUNTER.search(name)
+    return re.escape(name[: counter.start()]) + r"(\d+)" + re.escape(name[counter.end():])
+
+
+def _listing(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if path.is_file()] if folder.is_dir() else []
+
+
+def load_subject(folder: Path) -> Subject:
+    """Reads and checks folder/subject.yaml and that the video is there; InputError otherwise."""
+    folder = Path(folder).absolute()
+    path = folder / "subject.yaml"
+    if not folder.is_dir():
+        raise InputError("no such folder", where=str(folder), mend=_NEW)
+    if not path.is_file():
+        raise InputError("no subject.yaml in this folder", where=str(folder), mend=_NEW)
+    content = check_keys(read_yaml(path), ("video", "camera", "colour", "capture"), str(path))
+    camera = _camera(check_keys(content.get("camera"), [p.name for p in _CAMERA], f"{path}: camera"), path)
+    colour = check_keys(content.get("colour"), ("transfer",), f"{path}: colour")
+    capture = check_keys(content.get("capture"), ("moves",), f"{path}: capture")
+    video = _video(folder, content.get("video"), path)
+    transfer = _choice(colour.get("transfer", "srgb"), TRANSFERS, f"{path}: colour.transfer")
+    moves = _choice(capture.get("moves", "head"), MOVES, f"{path}: capture.moves")
+    subject = Subject(folder, folder.resolve().name, video, transfer=transfer, moves=moves, **camera)
+    _check_files(subject)
+    return subject
+
+
+def _camera(given: dict, path: Path) -> dict[str, float | None]:
+    camera = {p.name: p.parse(given.get(p.name), f"{path}: camera.{p.name}") for p in _CAMERA}
+    where = f"{path}: camera"
+    if camera["focal_length_px"] is not None and camera["focal_length_mm"] is not None:
+        raise InputError("both focal_length_px and focal_length_mm", where=where, mend="keep one of them")
+    if camera["focal_length_mm"] is not None and camera["sensor_width_mm"] is None:
+        raise InputError("focal_length_mm without sensor_width_mm", where=where,
+                         mend="add sensor_width_mm (36 for 'full frame equivalent' lengths)")
+    return camera
+
+
+def _choice(value: object, known: tuple[str, ...], where: str) -> str:
+    if value not in known:
+        raise InputError("value not known", where=where, got=repr(value),
+                         expected=" | ".join(known), mend=nearest(str(value).lower(), known))
+    return str(value)
+
+
+def _video(folder: Path, value: object, path: Path) -> Path:
+    """The video's absolute path; it must be written as a path that stays inside the subject's folder."""
+    where = f"{path}: video"
+    if not isinstance(value, str) or not value.strip():
+        raise InputError("no video named", where=where, expected="a file in the subject's folder, e.g. clip.mp4")
+    relative = PurePosixPath(value)
+    if relative.is_absolute() or ".." in relative.parts or "\\" in value or "\0" in value:
+        raise InputError("the path leaves the subject's folder", where=where, got=value,
+                         expected="a path inside it (a symbolic link there may point elsewhere)")
+    if len(_COUNTER.findall(value)) > len(_COUNTER.findall(relative.name)) or len(_COUNTER.findall(value)) > 1:
+        raise InputError("more than one counter, or one in a folder's name", where=where, got=value,
+                         expected="one in the file's name, e.g. frames/%05d.png")
+    return folder / relative
+
+
+def _check_files(subject: Subject) -> None:
+    where = str(subject.video)
+    files = subject.video_files()
+    if not files:
+        raise InputError("no such video", where=where, mend="correct 'video' in subject.yaml or put the file there")
+    for file in files:
+        try:
+            size = file.stat().st_size
+        except OSError as error:
+            raise InputError("cannot be read", where=str(file), got=error.strerror) from error
+        if size == 0:
+            raise InputError("the file is empty", where=str(file), mend="copy it from the camera again")

@@ -1,0 +1,138 @@
+"""What is declared and read: values of parameters, stage files, pipeline.yaml, subject.yaml."""
+
+import pytest
+from toy_runs import copy_pipeline, make_subject
+
+from shared.contract import Output, Parameter, Stage, load_subject
+from shared.contract.declare import parameter_table
+from shared.contract.folders import RunFolder
+from shared.contract.pipeline import load_pipeline, split_settings
+from shared.contract.source import fingerprint, read_declaration
+from shared.errors import InputError, LimnError
+
+STAGE = Stage(
+    name="read_text",
+    version=1,
+    help="Reads.",
+    inputs=(),
+    outputs=(Output("text.txt", "the text", unit="mm", space="uv"), Output("lines/%03d.txt", "lines", optional=True),
+             Output("when.json", "times", volatile=True, optional=True)),
+    parameters=(
+        Parameter("size", int, 10, "Size.", "texels", 1, 100),
+        Parameter("letters", str, "lower", "Letters.", choices=("lower", "upper")),
+        Parameter("limit", float, None, "Limit.", "mm", 0.0),
+        Parameter("fast", bool, False, "Speed."),
+    ),
+)
+
+
+@pytest.mark.parametrize("name, value, parsed", [
+    ("size", "20", 20), ("size", 20.0, 20), ("size", "2e1", 20), ("limit", "1e-3", 1e-3), ("limit", 2, 2.0),
+    ("limit", "none", None), ("limit", None, None), ("fast", "yes", True), ("fast", False, False), ("seed", "7", 7)])
+def test_values_are_typed(name, value, parsed):
+    result = STAGE.parse({name: value}, "here")[name]
+    assert result == parsed and type(result) is type(parsed)
+
+
+@pytest.mark.parametrize("name, value, hint", [
+    ("size", 0, "1 .. 100 texels"), ("size", 101, "1 .. 100"), ("size", "1.5", "whole number"), ("size", True, "whole"),
+    ("size", None, "whole number"), ("size", "nan", "whole"), ("limit", "inf", "a number >= 0 mm"),
+    ("limit", [1], "number"), ("letters", "loud", "one of lower, upper"), ("fast", "perhaps", "true or false"), 
+    ("sise", 1, "read_text.size?"), ("seed", -1, "0 .. ")])
+def test_bad_values_say_what_is_allowed(name, value, hint):
+    with pytest.raises(InputError, match=name) as error:
+        STAGE.parse({name: value}, "here")
+    assert hint in str(error.value) and "\n" not in str(error.value)
+
+
+def test_bad_default_is_refused():
+    with pytest.raises(InputError):
+        Parameter("size", int, 0, "Size.", minimum=1)
+
+
+def test_table_lists_every_parameter():
+    rows = parameter_table([STAGE]).splitlines()
+    assert len(rows) == 2 + len(STAGE.parameters)
+    assert "| read_text | `size` | `10` | 1 .. 100 | texels | Size. |" in rows
+
+
+def test_subject_facts(tmp_path):
+    folder = make_subject(tmp_path / "eve", settings="video: f/%03d.png\ncamera: {focal_length_mm: 60, "
+                          "sensor_width_mm: 22.3}\ncolour: {transfer: bt709}\ncapture: {moves: camera}\n")
+    (folder / "f").mkdir()
+    for name in ("010.png", "009.png", "cover.png", "011.jpg"):
+        (folder / "f" / name).write_bytes(b"x")
+    subject = load_subject(folder)
+    assert [path.name for path in subject.video_files()] == ["009.png", "010.png"]
+    assert (subject.name, subject.focal_length_mm, subject.sensor_width_mm) == ("eve", 60.0, 22.3)
+    assert (subject.focal_length_px, subject.transfer, subject.moves) == (None, "bt709", "camera")
+
+
+def test_declaration_is_read_without_the_stage_s_imports(tmp_path):
+    source = ("import no_such_package\nfrom shared.contract import Stage, Output\nSIZES = (1, 2)\nLAST = SIZES[-1]\n"
+              "STAGE = Stage('draw', LAST, 'Draws.', (), (Output('a', 'b'),))\nX = no_such_package.thing()\n")
+    path = tmp_path / "draw.py"
+    path.write_text(source)
+    assert read_declaration(path).version == 2
+    path.write_text(source.replace("LAST,", "no_such_package.n,"))
+    with pytest.raises(LimnError, match="no_such_package"):
+        read_declaration(path)
+    with pytest.raises(InputError, match="no such stage"):
+        read_declaration(tmp_path / "gone.py")
+
+
+def test_fingerprint_ignores_what_does_not_run(tmp_path):
+    first, second, third = (tmp_path / f"{name}.py" for name in "abc")
+    first.write_text('"""Doc."""\ndef f(x):\n    """Old."""\n    return x + 1\n')
+    second.write_text('"""Other."""\n\n\ndef f(x):\n    # why\n    """New."""\n    return (x + 1)\n')
+    third.write_text("def f(x):\n    return x + 2\n")
+    assert fingerprint(first) == fingerprint(second) != fingerprint(third)
+
+
+@pytest.mark.parametrize("old, new, hint", [
+    ("stages:", "stagse:", "did you mean stages?"),
+    ("needs: [read_text]}", "need: [read_text]}", "did you mean needs?"),
+    ("[count_words]", "[count_word]", "did you mean count_words?"),
+    ("draw_bars: {width", "draw_bar: {width", "did you mean draw_bars?"),
+    ("width: 4", "widht: 4", "did you mean draw_bars.width?"), ("width: 4", "width: 900", "1 .. 80 letters"),
+    ("needs: []", "needs: [export_page]", "in a circle"), ("needs: [read_text]", "needs: []", "needs differ"),
+    ("default_preset: standard", "default_preset: draught", "did you mean draft?"),
+    ("threads: 1", "threads: 0", "cores"),
+    ("package: toy", "package: toys", "no such stage")])
+def test_bad_pipeline_is_one_line(tmp_path, old, new, hint):
+    path = copy_pipeline(tmp_path / "toy")
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(InputError) as error:
+        load_pipeline(path).check()
+    assert hint in str(error.value) and "pipeline.yaml" in str(error.value) or "toys" in str(error.value)
+
+
+def test_parameters_come_from_defaults_step_preset_and_call(tmp_path):
+    path = copy_pipeline(tmp_path / "toy")
+    path.write_text(path.read_text().replace("{needs: [read_text]}", "{needs: [read_text], parameters: {least: 2}}"))
+    pipeline = load_pipeline(path)
+    stage, bars = pipeline.stages["count_words"], pipeline.stages["draw_bars"]
+    assert pipeline.parameters(stage, None, {})["least"] == 2
+    assert pipeline.parameters(stage, None, {"least": "3"})["least"] == 3
+    assert [pipeline.parameters(bars, preset, {})["width"] for preset in (None, "draft")] == [10, 4]
+
+
+def test_the_real_pipeline_is_sound():
+    pipeline = load_pipeline()
+    pipeline.check()
+    assert {"draft", "standard", "fine", "reference"} <= set(pipeline.presets)
+    assert pipeline.default_preset == "standard"
+
+
+@pytest.mark.parametrize("text", ["a", "a=1", "b.x=1", "a.=1"])
+def test_settings_need_a_stage_and_a_key(text):
+    with pytest.raises(InputError):
+        split_settings([text], ["a"])
+    assert split_settings(["a.x=y=z", "a.v= 1 "], ["a"]) == {"a": {"x": "y=z", "v": "1"}}
+
+
+def test_run_folder_with_out(tmp_path):
+    assert RunFolder.of(tmp_path / "anna", "anna", None).root == tmp_path / "anna"
+    assert RunFolder.of(tmp_path / "anna", "anna", tmp_path / "o").published("export_usd") == tmp_path / "o/anna/export"

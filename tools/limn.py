@@ -1,0 +1,189 @@
+"""limn: from a video of a head turn to a relightable head.
+
+    limn new CLIP            make a subject folder from a video
+    limn run SUBJECT...      do what is not done yet
+    limn plan SUBJECT...     what run would do, and why
+    limn status SUBJECT...   what lies where, sizes, times
+    limn report SUBJECT...   where the report is
+    limn clean SUBJECT...    remove intermediate results, keep export/
+    limn parameters          every stage's parameters
+
+Exit code 0: done. 1: a stage failed. 2: the input is at fault; then each line on stderr is one fault.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import webbrowser
+from collections.abc import Sequence
+from pathlib import Path
+
+from shared.contract.declare import parameter_table
+from shared.contract.pipeline import load_pipeline, split_settings
+from shared.contract.subject import MOVES, TRANSFERS
+from shared.contract.wording import unknown_name
+from shared.errors import InputError, LimnError
+from tools.cases import InputErrors, all_parameters, open_cases
+from tools.housekeeping import clean, report_path, status_lines
+from tools.plan import plan_case, plan_lines
+
+
+class _OneLineParser(argparse.ArgumentParser):
+    def error(self, message: str) -> None:
+        raise InputError(message, mend=f"see {self.prog} --help")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command; returns the exit code."""
+    try:
+        args = make_parser().parse_args(argv)
+        return args.command(args)
+    except InputErrors as errors:
+        for error in errors.errors:
+            print(f"limn: {error}", file=sys.stderr)
+        return 2
+    except InputError as error:
+        print(f"limn: {error}", file=sys.stderr)
+        return 2
+    except LimnError as error:
+        print(f"limn: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("limn: interrupted", file=sys.stderr)
+        return 1
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command line of limn."""
+    parser = _OneLineParser(prog="limn", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    run = _subject_command(commands, "run", run_command, "do what is not done yet")
+    plan = _subject_command(commands, "plan", plan_command, "what run would do, and why")
+    status = _subject_command(commands, "status", status_command, "what lies where, sizes, times")
+    report = _subject_command(commands, "report", report_command, "where the report is")
+    removal = _subject_command(commands, "clean", clean_command, "remove intermediate results, keep export/")
+    for command in (run, plan, status, report):
+        command.add_argument("--preset", help="a preset of pipeline.yaml")
+        command.add_argument("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help="a parameter")
+    for command in (plan, status):
+        command.add_argument("--verify", action="store_true", help="read every published file again")
+    run.add_argument("--cores", type=int, metavar="N", help="cores to use (all)")
+    run.add_argument("--profile", metavar="NAME", help="a Snakemake profile, for a cluster")
+    report.add_argument("--open", action="store_true", help="open it in the browser")
+    removal.add_argument("--dry-run", action="store_true", help="only say what would go")
+    _add_new(commands)
+    table = commands.add_parser("parameters", help="every stage's parameters as a table")
+    table.add_argument("stages", nargs="*", metavar="STAGE")
+    table.add_argument("--pipeline", type=Path, metavar="FILE")
+    table.set_defaults(command=parameters_command)
+    return parser
+
+
+def _subject_command(commands: argparse._SubParsersAction, name: str, command, text: str) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=text, description=text)
+    parser.add_argument("subjects", nargs="+", type=Path, metavar="SUBJECT", help="folder with subject.yaml")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write to DIR/<subject>/, not to the subject's folder")
+    parser.add_argument("--pipeline", type=Path, metavar="FILE", help="another pipeline.yaml")
+    parser.set_defaults(command=command)
+    return parser
+
+
+def _add_new(commands: argparse._SubParsersAction) -> None:
+    new = commands.add_parser("new", help="make a subject folder from a video", description="make a subject folder")
+    new.add_argument("clip", type=Path, metavar="CLIP", help="a video, or an image sequence as frames/%%05d.png")
+    new.add_argument("--name", help="name of the folder (the clip's)")
+    new.add_argument("--dest", type=Path, default=Path("."), metavar="DIR", help="where to make it (here)")
+    new.add_argument("--link", action="store_true", help="link to the clip instead of copying it")
+    new.add_argument("--focal-length-mm", type=float, metavar="MM", help="needs --sensor-width-mm")
+    new.add_argument("--sensor-width-mm", type=float, metavar="MM", help="36 for 'full frame equivalent' lengths")
+    new.add_argument("--focal-length-px", type=float, metavar="PX", help="instead, in pixels of the source frame")
+    new.add_argument("--transfer", choices=TRANSFERS, default="srgb", help="how the file encodes light (srgb)")
+    new.add_argument("--moves", choices=MOVES, default="head", help="what moves (head)")
+    new.set_defaults(command=new_command)
+
+
+def run_command(args: argparse.Namespace) -> int:
+    """limn run"""
+    from tools.workflow import Settings, run_cases
+
+    pipeline = load_pipeline(args.pipeline)
+    parameters = all_parameters(pipeline, args.preset, args.set)
+    cases = open_cases(args.subjects, args.out)
+    cores = args.cores if args.cores is not None else len(os.sched_getaffinity(0))
+    if cores < 1:
+        raise InputError("number of cores not allowed", where="--cores", got=cores, expected=">= 1")
+    given = split_settings(args.set, pipeline.stages)
+    preset = [f"--preset={args.preset}"] if args.preset else []
+    arguments = {name: preset + [f"--set={key}={value}" for key, value in given.get(name, {}).items()]
+                 for name in pipeline.stages}
+    return run_cases(cases, Settings(pipeline, parameters, arguments, args.out, cores, args.profile))
+
+
+def plan_command(args: argparse.Namespace) -> int:
+    """limn plan"""
+    return _for_each_plan(args, lambda case, plans: print("\n".join(plan_lines(case, plans))))
+
+
+def status_command(args: argparse.Namespace) -> int:
+    """limn status"""
+    return _for_each_plan(args, lambda case, plans: print("\n".join(status_lines(case, plans))))
+
+
+def report_command(args: argparse.Namespace) -> int:
+    """limn report"""
+    def show(case, plans) -> None:
+        path, remarks = report_path(case, plans)
+        for remark in remarks:
+            print(remark, file=sys.stderr)
+        print(path)
+        if args.open:
+            webbrowser.open(path.as_uri())
+
+    return _for_each_plan(args, show)
+
+
+def clean_command(args: argparse.Namespace) -> int:
+    """limn clean"""
+    pipeline = load_pipeline(args.pipeline)
+    for case in open_cases(args.subjects, args.out):
+        print("\n".join(clean(case.run, pipeline, args.dry_run)))
+    return 0
+
+
+def new_command(args: argparse.Namespace) -> int:
+    """limn new"""
+    from tools.new_subject import NewSubject, make_subject
+
+    folder, facts = make_subject(NewSubject(
+        args.clip, args.name, args.dest, args.link, args.focal_length_mm, args.sensor_width_mm, args.focal_length_px,
+        args.transfer, args.moves))
+    print(f"{folder}: {facts}")
+    print(f"look through {folder / 'subject.yaml'}, then: limn run {folder}")
+    return 0
+
+
+def parameters_command(args: argparse.Namespace) -> int:
+    """limn parameters"""
+    stages = load_pipeline(args.pipeline).stages
+    for name in args.stages:
+        if name not in stages:
+            raise unknown_name("stage", name, stages, "parameters")
+    print(parameter_table([stage for name, stage in stages.items() if not args.stages or name in args.stages]), end="")
+    return 0
+
+
+def _for_each_plan(args: argparse.Namespace, show) -> int:
+    pipeline = load_pipeline(args.pipeline)
+    parameters = all_parameters(pipeline, args.preset, args.set)
+    for case in open_cases(args.subjects, args.out):
+        show(case, plan_case(pipeline, case, parameters, getattr(args, "verify", False)))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,123 @@
+"""Shows what running stages tell: reads their event files, keeps one bar per stage on a terminal, lines elsewhere."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from shared.contract.progress import terminal_bar
+
+_LINE_S = 10.0
+
+
+@dataclass
+class Track:
+    """One stage of one subject, as far as its events tell."""
+
+    subject: str
+    stage: str
+    path: Path
+    read_to: int = 0
+    state: str = "waiting"
+    seconds: float = 0.0
+    message: str = ""
+    log: str = ""
+    label: str = ""
+    bar: object = None
+    last_line: float = field(default_factory=time.monotonic)
+
+    def new_events(self) -> list[dict]:
+        """Events since the last call; a line that is not complete yet is left for the next."""
+        try:
+            with open(self.path, "rb") as file:
+                file.seek(self.read_to)
+                data = file.read()
+        except FileNotFoundError:
+            return []
+        whole = data[: data.rfind(b"\n") + 1]
+        self.read_to += len(whole)
+        return [json.loads(line) for line in whole.splitlines()]
+
+
+class Watch:
+    """Follows the event files of a run."""
+
+    def __init__(self, tracks: Sequence[Track]) -> None:
+        self.tracks = list(tracks)
+        self._terminal = sys.stderr.isatty()
+        self._width = max((len(f"{t.subject}  {t.stage}") for t in self.tracks), default=0)
+
+    def poll(self) -> None:
+        """Shows what is new."""
+        for track in self.tracks:
+            for event in track.new_events():
+                getattr(self, f"_on_{event['kind']}")(track, event)
+
+    def close(self) -> None:
+        """Removes the bars."""
+        for track in self.tracks:
+            self._end_bar(track)
+
+    def _say(self, track: Track, text: str) -> None:
+        line = f"{track.subject + '  ' + track.stage:{self._width}}  {text}"
+        if self._terminal:
+            from tqdm import tqdm
+
+            tqdm.write(line, file=sys.stderr)
+        else:
+            print(line, file=sys.stderr, flush=True)
+
+    def _on_started(self, track: Track, _event: dict) -> None:
+        track.state, track.message = "running", ""
+        self._say(track, "started")
+
+    def _on_progress(self, track: Track, event: dict) -> None:
+        label, done, total = event["label"], event["done"], event["total"]
+        if self._terminal:
+            self._update_bar(track, label, done, total)
+        elif time.monotonic() - track.last_line >= _LINE_S:
+            track.last_line = time.monotonic()
+            self._say(track, f"{label} {done}" + (f"/{total}" if total is not None else ""))
+
+    def _on_warning(self, track: Track, event: dict) -> None:
+        self._say(track, f"warning: {event['text']}")
+
+    def _on_current(self, track: Track, _event: dict) -> None:
+        track.state = "current"
+        self._say(track, "current")
+
+    def _on_done(self, track: Track, event: dict) -> None:
+        track.state, track.seconds = "done", event["seconds"]
+        self._end_bar(track)
+        self._say(track, f"done in {track.seconds:.1f} s")
+
+    def _on_input_error(self, track: Track, event: dict) -> None:
+        track.state, track.message = "input error", event["message"]
+        self._end_bar(track)
+        self._say(track, event["message"])
+
+    def _on_failed(self, track: Track, event: dict) -> None:
+        track.state, track.message, track.log = "failed", event["message"], event["log"]
+        self._end_bar(track)
+        self._say(track, f"failed: {event['message']}")
+        for line in event["last"]:
+            self._say(track, f"| {line}")
+        self._say(track, f"the whole log: {event['log']}")
+
+    def _update_bar(self, track: Track, label: str, done: int, total: int | None) -> None:
+        if track.bar is not None and (track.label != label or done < track.bar.n):
+            self._end_bar(track)
+        if track.bar is None:
+            track.label = label
+            track.bar = terminal_bar(None, f"{track.subject}  {track.stage}: {label}", total)
+        track.bar.update(done - track.bar.n)
+
+    @staticmethod
+    def _end_bar(track: Track) -> None:
+        if track.bar is not None:
+            track.bar.close()
+            track.bar = None
