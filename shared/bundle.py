@@ -61,7 +61,8 @@ def adjust(
 
     observations_px [F, N, 2], NaN where a point is not seen; camera_from_points [F, 4, 4] and points [N, 3] are the
     start. loss_scale_px: residuals beyond it lose their pull. prior_mm: standard deviation of each point about its
-    start (in units of one observation of loss_scale_px). The intrinsics stay fixed.
+    start, weighed against all its observations together as one of loss_scale_px, since the errors of a track go along
+    with each other: with wide rotation the prior is nothing, with little it keeps the depth. The intrinsics stay fixed.
     """
     reconstruction, point_ids = _reconstruction(observations_px, camera_from_points, points, intrinsics, size)
     frames = len(camera_from_points)
@@ -74,7 +75,9 @@ def adjust(
         config.add_image(i + 1)
     config.set_constant_cam_intrinsics(1)
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
-    anchors = _add_point_priors(adjuster.problem, reconstruction, point_ids, prior_mm / max(loss_scale_px, 1e-6))
+    length = np.isfinite(observations_px[..., 0]).sum(0)
+    deviation = prior_mm / (loss_scale_px * np.sqrt(np.maximum(length, 1)))
+    anchors = _add_point_priors(adjuster.problem, reconstruction, point_ids, deviation)
     pyceres.solve(_solver_options(max_iterations), adjuster.problem, pyceres.SolverSummary())
     del anchors
     poses = np.stack([_matrix(reconstruction.images[i + 1].cam_from_world()) for i in range(frames)])
@@ -157,11 +160,11 @@ def _reconstruction(observations_px, camera_from_points, points, intrinsics, siz
     return reconstruction, point_ids
 
 
-def _add_point_priors(problem, reconstruction, point_ids, deviation: float) -> list:
+def _add_point_priors(problem, reconstruction, point_ids, deviation: np.ndarray) -> list:
     """Pulls each point to its start; -> what has to stay alive until the problem is solved."""
     anchors = []
-    covariance = np.eye(3) * deviation**2
-    for point_id in point_ids.values():
+    for j, point_id in point_ids.items():
+        covariance = np.eye(3) * deviation[j] ** 2
         position = reconstruction.points3D[point_id].xyz
         cost = pyceres.factors.NormalPrior(position.copy(), covariance)
         loss = pyceres.TrivialLoss()
