@@ -7,7 +7,7 @@ from toy_head import toy_head
 from shared.geometry import project, rigid, rotation_from_vector
 from shared.mesh import interpolate
 from shared.raycast import RayScene
-from shared.solve.fit_head import FitWeights, fit_codes, fit_surface, triangulate
+from shared.solve.fit_head import FitWeights, fit_codes, fit_surface, landmarks_on_points, triangulate
 
 MODEL = toy_head()
 ROTATION = rotation_from_vector(np.array([0.1, -0.2, 0.05]))
@@ -75,3 +75,15 @@ def test_triangulation_inverts_projection():
     )
     lens = np.array([[1000.0, 0, 320], [0, 1000.0, 240], [0, 0, 1]])
     assert np.allclose(triangulate(project(points, poses, lens)[0], poses, lens), points, atol=1e-6)
+
+
+def test_landmarks_take_the_depth_of_the_tracks_around_them():
+    truth = true_head()
+    points, _ = observed(truth, noise_mm=0.0)
+    named = (MODEL.landmarks(truth) - SHIFT) @ ROTATION / SCALE
+    middle = points.mean(0)
+    poses = rigid(np.diag([1.0, -1, -1])[None], (np.diag([-1.0, 1, 1]) @ middle + [0, 0, 900.0])[None])
+    lens = np.array([[1000.0, 0, 320], [0, 1000.0, 240], [0, 0, 1]])
+    found = landmarks_on_points(project(named, poses, lens)[0], poses, points, lens)
+    towards = named[:, 2] > np.percentile(named[:, 2], 60)
+    assert np.median(np.linalg.norm(found - named, axis=1)[towards]) < 2.0

@@ -10,7 +10,7 @@ and Sorkine, On linear variational surface deformation methods, TVCG 2008.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sparse
@@ -18,7 +18,7 @@ from scipy.optimize import lsq_linear
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from shared.geometry import rotation_from_vector, similarity_from_points
+from shared.geometry import project, rotation_from_vector, similarity_from_points
 from shared.head_model import HeadModel
 from shared.mesh import interpolate, uniform_laplacian, vertex_normals
 
@@ -70,6 +70,12 @@ class FitWeights:
     identity: float = 1.0
     expression: float = 0.6
     stiffness: float = 4.0
+
+
+    def for_depth_noise(self, noise_mm: float) -> FitWeights:
+        """Weights for track points whose depth is uncertain by noise_mm: the model counts more, the surface is stiffer."""
+        track_mm = float(np.hypot(self.track_mm, noise_mm))
+        return replace(self, track_mm=track_mm, stiffness=self.stiffness * (1.0 + (noise_mm / 0.5) ** 2))
 
 
 def fit_codes(
@@ -202,6 +208,25 @@ def fit_surface(model: HeadModel, fit: HeadFit, points: np.ndarray, weights: Fit
         correction = splu(matrix.tocsc()).solve(load[:, None] * target)
         vertices = fit.vertices + correction
     return HeadFit(fit.scale, fit.rotation, fit.translation, fit.identity, fit.expression, vertices)
+
+
+def landmarks_on_points(
+    landmarks_px: np.ndarray, camera_from_points: np.ndarray, points: np.ndarray, intrinsics: np.ndarray
+) -> np.ndarray:
+    """Landmarks [468, 3] as points: the pixel of each frame, at the depth of the track points around it, their median.
+
+    landmarks_px [F, 468, 2], poses [F, 4, 4], points [N, 3]. Landmarks slide with the view, so that triangulating them
+    would put their sliding into the depth; here they only tell where on the tracked surface a feature lies.
+    """
+    pixels, depth = project(points, camera_from_points, intrinsics)
+    placed = np.zeros((len(landmarks_px), landmarks_px.shape[1], 3))
+    for f, pose in enumerate(camera_from_points):
+        distance, near = cKDTree(pixels[f]).query(landmarks_px[f], k=min(6, len(points)))
+        weight = 1.0 / (distance + 1.0)
+        z = (weight * depth[f][near]).sum(1, keepdims=True) / weight.sum(1, keepdims=True)
+        ray = (landmarks_px[f] - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]]
+        placed[f] = (np.concatenate([ray * z, z], axis=1) - pose[:3, 3]) @ pose[:3, :3]
+    return np.median(placed, axis=0)
 
 
 def triangulate(points_px: np.ndarray, camera_from_points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from shared.geometry import camera_centres, project
 from shared.head_model import HeadModel
 from shared.mesh import normalised, vertex_normals
 from shared.raycast import RayScene
-from shared.solve.fit_head import FitWeights, HeadFit, fit_codes, fit_surface, triangulate
+from shared.solve.fit_head import FitWeights, HeadFit, fit_codes, fit_surface, landmarks_on_points, triangulate
 from shared.tracks import (
     SurfaceGrid,
     dense_tracks,
@@ -30,6 +30,9 @@ from shared.tracks import (
 
 UNTRACKED_SEGMENTS = ("eyes", "eye_sockets", "inner_mouth", "neck", "scalp", "ears")
 """Not rigid with the skull, or hair: no tracks from there."""
+
+LANDMARK_FRAMES = 15
+"""Landmarks are taken from so many frames around the middle of the motion."""
 
 LEAST_TRACKS = 30
 """A frame with fewer tracks has no reliable pose."""
@@ -189,7 +192,7 @@ def _first_pass(clip, start, posed, settings, progress) -> tuple[BundleSolution,
         progress=lambda frames: progress(frames, "first tracks"),
     )
     points = points_on_grid(grid, where, start.points)
-    return _adjusted(clip, tracks, points, start.camera_from_points, 2.5 * settings.loss_scale_px, 6 * settings.prior_mm)
+    return _adjusted(clip, tracks, points, start.camera_from_points, 2.5 * settings.loss_scale_px, 2 * settings.prior_mm)
 
 
 def _mesh_pass(clip, model, solution, reliable, fit, settings, index, progress) -> tuple[BundleSolution, np.ndarray]:
@@ -279,10 +282,21 @@ def _adjusted(clip, tracks, points, poses, loss_scale_px, prior_mm) -> tuple[Bun
 
 
 def _fit(clip, model, solution, reliable, settings) -> HeadFit:
-    """Codes, then the free correction, to track points and to landmarks triangulated from the near-frontal frames."""
+    """Codes, then the free correction, to track points and to the landmarks as they lie among them."""
     poses = solution.camera_from_points[reliable]
     directions = normalised(camera_centres(poses))
-    frontal = np.argsort(-(directions @ normalised(directions.mean(0))))[: max(6, reliable.sum() // 2)]
-    landmarks = triangulate(clip.landmarks_px[reliable][frontal], poses[frontal], clip.intrinsics)
-    fit = fit_codes(model, solution.points, landmarks, settings.fit)
-    return fit_surface(model, fit, solution.points, settings.fit)
+    central = np.argsort(-(directions @ normalised(directions.mean(0))))[:LANDMARK_FRAMES]
+    landmarks = landmarks_on_points(
+        clip.landmarks_px[reliable][central], poses[central], solution.points, clip.intrinsics
+    )
+    weights = settings.fit.for_depth_noise(_depth_noise_mm(solution, poses, clip.intrinsics))
+    fit = fit_codes(model, solution.points, landmarks, weights)
+    return fit_surface(model, fit, solution.points, weights)
+
+
+def _depth_noise_mm(solution: BundleSolution, poses: np.ndarray, intrinsics: np.ndarray) -> float:
+    """How far a track's typical error moves a point in depth, given the clip's rotation (half of the widest angle)."""
+    directions = normalised(camera_centres(poses))
+    half_angle = 0.5 * np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0))
+    error_mm = np.nanmedian(solution.error_px) * np.median(poses[:, 2, 3]) / intrinsics[0, 0]
+    return float(error_mm / max(np.sin(half_angle), 0.01))
