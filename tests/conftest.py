@@ -1,6 +1,16 @@
-"""Threads are fixed so that sums run in one order; the tests' own shapes can be imported."""
+"""The tests' own shapes can be imported; the tiny subject runs once for all tests that need it."""
 
 import sys
 from pathlib import Path
 
+import pytest
+
 sys.path.insert(0, str(Path(__file__).parent))
+
+
+@pytest.fixture(scope="session")
+def tiny_run(tmp_path_factory):
+    """The folder (work/ and export/) of the tiny subject, from clip to export."""
+    from tools.goldens import run_tiny
+
+    return run_tiny(tmp_path_factory.mktemp("tiny_run"))

@@ -1,0 +1,216 @@
+"""Make a head-turn clip whose every truth is known: the demo subject, and at tiny size the tests' subject.
+
+    python -m tools.synthesize DEST [--preset demo|tiny] [--size 400] [--frames 48] [--seed 0] [--light room] ...
+
+Writes:  DEST/subject.yaml, capture.json, the clip (video.avi, or frames/%04d.png), synthesis.json (how it was made);
+         gt/: mesh.obj, albedo.exr, specular.exr, roughness.exr, mask.exr (UV), envmap.exr, poses.npz, and for some
+         frames frames/NNNN_*.exr and .png; relight/: the same head under other lights. tools/score.py reads all of it.
+Method:  a random head of the head model with procedural skin, bumps, bust and light; direct light with one diffuse
+         bounce and the GGX lobe, traced with embree (synth_irradiance, synth_camera); sensor noise, 8-bit sRGB.
+The clip is FFV1 in AVI: of the encoders in OpenCV's wheel the lossy ones shift colours by 2 to 3 codes on their way
+through YUV 4:2:0, FFV1 returns every code value. The same arguments give the same bytes, whatever the number of
+processes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from shared.envmap import latlong_directions
+from shared.errors import InputError
+from shared.geometry import rigid, rotation_from_vector, world_from_head
+from shared.head_model import HeadModel
+from shared.io.arrays import save_arrays, write_json
+from shared.io.models import load_head_model
+from tools import synth_output
+from tools.synth_camera import Camera, PictureQuality
+from tools.synth_head import Head, face_part, head_turn, random_head
+from tools.synth_irradiance import IrradianceQuality, Shot
+from tools.synth_light import ENVIRONMENTS, procedural_environment
+from tools.synth_render import RenderQuality, Scene, render
+from tools.synth_skin import Complexion, SkinPainter
+
+FOCAL_MM, SENSOR_MM, DISTANCE_MM, FPS = 60.0, 22.3, 950.0, 25.0
+TOP_MARGIN_MM = 27.0
+FACE_RADIANCE = 0.32
+"""Mean linear radiance of the face, seen from the front, to which the exposure is set."""
+RELIGHT_YAWS_DEG = {"front": 0.0, "left15": -15.0, "right15": 15.0}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that decides the result.
+
+    level: subdivisions of the head model. noise: standard deviation of the sensor at full scale. lights: the clip's,
+    then those of relight/. truth_frames: how many frames get all buffers. mantissa_bits: precision of the truth on
+    disk. face_truth_only: gt/mesh.obj holds the face without the rest of the head.
+    """
+
+    size: int = 400
+    frames: int = 48
+    seed: int = 0
+    eyes: str = "open"
+    tone: float = 0.35
+    lights: tuple[str, ...] = ("room", "studio", "sky")
+    light_height: int = 64
+    noise: float = 0.006
+    level: int = 2
+    texture: int = 1024
+    truth_frames: int = 8
+    mantissa_bits: int = 10
+    face_truth_only: bool = False
+    video: str = "video.avi"
+    irradiance: IrradianceQuality = IrradianceQuality()
+    picture: PictureQuality = PictureQuality()
+
+
+PRESETS = {
+    "demo": Settings(),
+    "tiny": Settings(size=144, frames=12, level=0, texture=128, truth_frames=1, mantissa_bits=4,
+                     face_truth_only=True, lights=("room",), light_height=32, noise=0.0015, video="frames/%04d.png",
+                     irradiance=IrradianceQuality(size=160, directions=768)),
+}
+
+
+def synthesize(destination: Path, settings: Settings, processes: int) -> None:
+    """Makes the subject in `destination`, which may not hold one yet. Errors: InputError."""
+    if (destination / "subject.yaml").exists():
+        raise InputError("holds a subject already", where=str(destination), mend="choose another folder or remove it")
+    head = random_head(_model(settings.level), settings.seed, settings.eyes == "closed")
+    materials = SkinPainter(head, settings.texture, settings.seed).paint(Complexion(tone=settings.tone))
+    lights = tuple(light_of(name, settings) for name in settings.lights)
+    scene = Scene(head.mesh, materials, lights)
+    camera = Camera(settings.size, settings.size, FOCAL_MM / SENSOR_MM * settings.size)
+    shots = plan_shots(head, settings)
+    truth = np.unique(np.linspace(0, settings.frames - 1, settings.truth_frames).round().astype(int))
+    destination.mkdir(parents=True, exist_ok=True)
+    mesh = face_part(head) if settings.face_truth_only else head.mesh
+    synth_output.write_scene_truth(destination / "gt", scene, mesh, settings.mantissa_bits)
+    poses = np.stack([shot.camera_from_head for shot in shots[:settings.frames]])
+    synth_output.write_poses(destination / "gt" / "poses.npz", poses, camera, truth)
+    with_buffers = [i in truth or i >= settings.frames for i in range(len(shots))]
+    quality = RenderQuality(settings.irradiance, settings.picture, settings.seed)
+    pictures = render(scene, shots, camera, quality, with_buffers, processes)
+    _write_clip(destination, settings, camera, truth, islice(pictures, settings.frames))
+    if len(lights) > 1:
+        _write_relight(destination / "relight", settings, scene, shots[settings.frames:], pictures)
+    write_json(destination / "synthesis.json", asdict(settings))
+    # Last, so that an interrupted run leaves no subject.
+    synth_output.write_description(destination, camera, FOCAL_MM, SENSOR_MM, settings.frames, FPS, settings.video)
+
+
+def _write_clip(destination: Path, settings: Settings, camera: Camera, truth: np.ndarray,
+                pictures: Iterable[dict[str, np.ndarray]]) -> None:
+    clip = synth_output.ClipWriter(destination / settings.video, (camera.width, camera.height), FPS)
+    for index, images in enumerate(tqdm(pictures, "frames", settings.frames, disable=None)):
+        clip.add(synth_output.sensor_codes(images["radiance"], settings.noise, settings.seed * 1000 + index))
+        if index in truth:
+            stem = str(destination / "gt" / "frames" / f"{index:04d}")
+            synth_output.write_buffers(stem, images, images, settings.mantissa_bits)
+    clip.close()
+
+
+def _write_relight(folder: Path, settings: Settings, scene: Scene, shots: list[Shot],
+                   pictures: Iterable[dict[str, np.ndarray]]) -> None:
+    folder.mkdir(exist_ok=True)
+    for name, light in zip(settings.lights[1:], scene.lights[1:], strict=True):
+        synth_output.write_environment(folder / f"{name}_envmap.exr", light)
+    cases = [f"{name}_{view}" for name in settings.lights[1:] for view in RELIGHT_YAWS_DEG]
+    for case, images in zip(cases, pictures, strict=True):
+        synth_output.write_buffers(str(folder / case), images, ("radiance", "mask", "head"), settings.mantissa_bits)
+    save_arrays(folder / "poses.npz", **{view: shot.camera_from_head for view, shot in
+                                         zip(RELIGHT_YAWS_DEG, shots, strict=False)})
+
+
+def _model(level: int) -> HeadModel:
+    model = load_head_model()
+    for _ in range(level):
+        model = model.subdivided()
+    return model
+
+
+def light_of(name: str, settings: Settings) -> np.ndarray:
+    """The named environment, scaled so that skin that faces the camera has a radiance of FACE_RADIANCE."""
+    environment = procedural_environment(name, settings.seed, settings.light_height)
+    directions = latlong_directions(environment.shape[0])
+    solid_angle = np.sin(np.arccos(directions[..., 1])) * (np.pi / environment.shape[0]) ** 2
+    cosine = np.clip(directions[..., 2], 0, 1)
+    irradiance = (environment * (cosine * solid_angle)[..., None]).sum((0, 1)).mean()
+    skin_albedo = 0.52 * np.exp(-settings.tone)
+    return (environment * (FACE_RADIANCE * np.pi / (irradiance * skin_albedo))).astype(np.float32)
+
+
+def plan_shots(head: Head, settings: Settings) -> list[Shot]:
+    """The clip's frames, then three views under each further light."""
+    height = head.mesh.vertices[:, 1].max() + TOP_MARGIN_MM - 0.5 * SENSOR_MM / FOCAL_MM * DISTANCE_MM
+    poses = list(head_turn(settings.frames, DISTANCE_MM, height, settings.seed))
+    light = [0] * settings.frames
+    for index in range(1, len(settings.lights)):
+        poses += [relight_pose(yaw, height) for yaw in RELIGHT_YAWS_DEG.values()]
+        light += [index] * len(RELIGHT_YAWS_DEG)
+    turns = world_from_head(np.stack(poses), "head")
+    return [Shot(pose, turn, which, settings.seed * 1000 + i)
+            for i, (pose, turn, which) in enumerate(zip(poses, turns, light, strict=True))]
+
+
+def relight_pose(yaw_deg: float, height_mm: float) -> np.ndarray:
+    """camera_from_head [4, 4] turned about the head's own axis."""
+    flip = np.diag([1.0, -1.0, -1.0])
+    turn = rotation_from_vector(np.array([0.0, np.radians(yaw_deg), 0.0]))
+    return rigid(flip @ turn, np.array([0.0, height_mm, DISTANCE_MM]))
+
+
+def parse(arguments: list[str] | None) -> tuple[Path, Settings, int]:
+    """Command line -> destination, settings, number of processes."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("destination", type=Path, help="folder of the new subject")
+    parser.add_argument("--preset", choices=PRESETS, default="demo", help="values of all that follows (default demo)")
+    parser.add_argument("--size", type=int, help="width and height, pixels")
+    parser.add_argument("--frames", type=int, help="length of the clip")
+    parser.add_argument("--seed", type=int, help="decides head, skin, light and motion")
+    parser.add_argument("--eyes", choices=("open", "closed"))
+    parser.add_argument("--tone", type=float, help="melanin: 0.15 fair to 1.6 dark")
+    parser.add_argument("--light", choices=ENVIRONMENTS, help="the clip's light")
+    parser.add_argument("--noise", type=float, help="sensor noise at full scale, share of it")
+    parser.add_argument("--processes", type=int, default=2, help="worker processes (default 2)")
+    options = parser.parse_args(arguments)
+    settings = PRESETS[options.preset]
+    given = {name: getattr(options, name) for name in ("size", "frames", "seed", "eyes", "tone", "noise")}
+    settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
+    if options.light:
+        others = tuple(name for name in settings.lights if name != options.light)
+        settings = replace(settings, lights=(options.light, *others)[:len(settings.lights)])
+    return options.destination, _checked(settings), options.processes
+
+
+def _checked(settings: Settings) -> Settings:
+    for name, low, high in (("size", 64, 2048), ("frames", 8, 1000), ("seed", 0, 10**6), ("tone", 0.05, 2.0),
+                            ("noise", 0.0, 0.1)):
+        value = getattr(settings, name)
+        if not low <= value <= high:
+            raise InputError("out of range", where=f"--{name}", got=value, expected=f"{low} to {high}")
+    return settings
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; exit code 0, or 2 when the input is at fault."""
+    try:
+        destination, settings, processes = parse(arguments)
+        synthesize(destination, settings, processes)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"{destination}: {settings.frames} frames of {settings.size} x {settings.size} px with truth")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
