@@ -19,13 +19,14 @@ def main() -> int:
     began = time.monotonic()
     if not (SUBJECT / "subject.yaml").exists():
         print("Rendering the demo subject: a head that turns, with every truth known ...", flush=True)
-        synthesize([str(SUBJECT), "--preset", "demo"])
-    code = limn(["run", str(SUBJECT)])
-    if code != 0:
+        if code := synthesize([str(SUBJECT), "--preset", "demo"]):
+            return code
+    if code := limn(["run", str(SUBJECT)]):
         return code
-    print("\nScores against the subject's truth:", flush=True)
-    score([str(SUBJECT), str(SUBJECT / "export")])
     export = SUBJECT / "export"
+    print("\nScores against the subject's truth:", flush=True)
+    if code := score([str(SUBJECT), str(export)]):
+        return code
     print(f"\nDone in {time.monotonic() - began:.0f} s. Open")
     for name, what in (
         ("report.html", "the clip beside the re-render, maps, light, poses"),
