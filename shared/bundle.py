@@ -175,7 +175,9 @@ def _add_point_priors(problem, reconstruction, point_ids, deviation: np.ndarray)
 
 def _solver_options(max_iterations: int) -> pyceres.SolverOptions:
     options = pyceres.SolverOptions()
-    options.linear_solver_type = pyceres.LinearSolverType.SPARSE_SCHUR
+    # every point is seen in most frames, so the reduced system is full: building it costs more than iterating on it
+    options.linear_solver_type = pyceres.LinearSolverType.ITERATIVE_SCHUR
+    options.preconditioner_type = pyceres.PreconditionerType.SCHUR_JACOBI
     options.max_num_iterations = max_iterations
     options.function_tolerance = 1e-6
     options.num_threads = 1  # one summation order, so the same bytes each time

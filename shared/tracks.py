@@ -10,6 +10,8 @@ Forward-backward error, ICPR 2010.
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -36,6 +38,13 @@ def unusable_pixels(rgb: np.ndarray) -> np.ndarray:
     """[H, W, 3] uint8 -> [H, W] uint8, 1 where a channel is clipped or all are crushed, grown by two pixels."""
     bad = (rgb.max(-1) >= CLIPPED_CODE) | (rgb.max(-1) <= CRUSHED_CODE)
     return cv2.dilate(bad.astype(np.uint8), np.ones((5, 5), np.uint8))
+
+
+THREADS = len(os.sched_getaffinity(0))
+"""Frames tracked at once: OpenCV lets go of the interpreter, and its own threads gain little on pictures this small."""
+
+LEAST_SHOWN = 20
+"""A frame that shows fewer of the grid's points is not tracked."""
 
 
 @dataclass(frozen=True)
@@ -128,31 +137,53 @@ def dense_tracks(
     """
     rows, columns = _grid_points(grid, count)
     tracks = np.full((len(contrast), len(rows), 2), np.nan)
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     layout = grid.warp(positions_px[grid.reference])
     layout[~grid.valid] = -9.0
     target = _sample(contrast[grid.reference], layout)
     usable = (_sample(unusable[grid.reference], layout, cv2.INTER_NEAREST) == 0) & grid.valid
-    for i in progress(range(len(contrast))):
-        shown = grid.warp(visible[i].astype(np.float32)[:, None])[..., 0] > 0.99
-        if shown[rows, columns].sum() < 20:
-            continue
-        layout = grid.warp(positions_px[i])
-        layout[~(grid.valid & shown)] = -9.0
-        image = _sample(contrast[i], layout)
-        masked = np.where(shown & grid.valid, target, 128).astype(np.uint8)
-        image[~(shown & grid.valid)] = 128
-        forward, backward = flow.calc(masked, image, None), flow.calc(image, masked, None)
-        moved = forward[rows, columns]
-        at = np.stack([columns, rows], axis=1).astype(np.float32) + moved
-        returned = moved + _lookup(backward, at)
-        good = np.linalg.norm(returned, axis=1) < 0.3 * grid.scale
-        good &= np.linalg.norm(moved, axis=1) < search_px * grid.scale
-        good &= usable[rows, columns] & shown[rows, columns]
-        found = _lookup(layout, at)
-        good &= (_sample(unusable[i], found[:, None], cv2.INTER_NEAREST)[:, 0] == 0) & (found.min(1) > 0)
-        tracks[i, good] = found[good]
+    place = _Places(rows, columns, usable[rows, columns], search_px)
+
+    def track(i: int) -> np.ndarray:
+        shown = grid.valid & (grid.warp(visible[i].astype(np.float32)[:, None])[..., 0] > 0.99)
+        return _track_frame(grid, target, contrast[i], unusable[i], grid.warp(positions_px[i]), shown, place)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        for i, found in zip(progress(range(len(contrast))), pool.map(track, range(len(contrast))), strict=True):
+            tracks[i] = found
     return tracks, np.stack([rows, columns], axis=1)
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Grid points to track: row and column [N], usable in the reference [N] bool, the largest believed error."""
+
+    rows: np.ndarray
+    columns: np.ndarray
+    usable: np.ndarray
+    search_px: float
+
+
+def _track_frame(grid, target, contrast, unusable, layout, shown, place: _Places) -> np.ndarray:
+    """Positions [N, 2] of the grid's points in one frame, NaN where not found; layout [h, w, 2] is where they should be."""
+    rows, columns = place.rows, place.columns
+    found = np.full((len(rows), 2), np.nan)
+    if shown[rows, columns].sum() < LEAST_SHOWN:
+        return found
+    layout[~shown] = -9.0
+    image = _sample(contrast, layout)
+    image[~shown] = 128
+    masked = np.where(shown, target, 128).astype(np.uint8)
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    forward, backward = flow.calc(masked, image, None), flow.calc(image, masked, None)
+    moved = forward[rows, columns]
+    at = np.stack([columns, rows], axis=1).astype(np.float32) + moved
+    good = np.linalg.norm(moved + _lookup(backward, at), axis=1) < 0.3 * grid.scale
+    good &= np.linalg.norm(moved, axis=1) < place.search_px * grid.scale
+    good &= place.usable & shown[rows, columns]
+    reached = _lookup(layout, at)
+    good &= (_sample(unusable, reached[:, None], cv2.INTER_NEAREST)[:, 0] == 0) & (reached.min(1) > 0)
+    found[good] = reached[good]
+    return found
 
 
 def _grid_points(grid: SurfaceGrid, count: int) -> tuple[np.ndarray, np.ndarray]:
