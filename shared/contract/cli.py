@@ -119,9 +119,15 @@ def parse_request(stage: Stage, argv: Sequence[str] | None) -> Request:
 
 
 def set_threads(count: int) -> None:
-    """Limits the libraries to so many threads; sums then run in one order."""
+    """Limits the libraries to so many threads; sums then run in one order.
+
+    Idle OpenMP threads sleep: spinning ones stall each other for minutes when anything else wants the cores. MKL's
+    matrix products depend on where the arrays lie in memory unless it is told to be reproducible.
+    """
     for name in _THREAD_VARIABLES:
         os.environ[name] = str(count)
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("MKL_CBWR", "COMPATIBLE")
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(count)
     if "cv2" in sys.modules:

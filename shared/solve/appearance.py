@@ -15,8 +15,8 @@ that were held out stop improving.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -25,11 +25,12 @@ from shared.brdf import hemispherical_albedo
 from shared.gather import Samples
 from shared.lobes import LobeTable, specular_tables
 from shared.solve.light import FrameLight, LightPriors, resample_light
-from shared.solve.scale import most_likely_irradiance, scale_prior
+from shared.solve.scale import Highlights, most_likely_irradiance
 from shared.transfer import Nodes, Points, Transfer, nearest_points, node_radiosity
 
 MINIMUM_ALBEDO, MAXIMUM_ALBEDO = 0.003, 1.0
-ROUGHNESS_RANGE = (0.25, 0.7)
+ALBEDO_PULL = 25.0
+"""Precision of the prior on a point's albedo: a standard deviation of 0.2."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,8 @@ class Settings:
     bounce: bool = True
     specular: bool = True
     roughness: float = 0.45
-    specular_prior: tuple[float, float] = (0.7, 0.3)
+    search_roughness: bool = True
+    specular_prior: tuple[float, float] = (0.7, 0.25)
 
 
 @dataclass(frozen=True)
@@ -105,9 +107,10 @@ class AppearanceSolver:
         self.table = LobeTable(capture.points.normals, capture.transfer.visibility(), capture.directions)
         self.node_to_point = nearest_points(capture.nodes.points, capture.points)
         self.direct = torch.from_numpy(capture.transfer.direct.astype(np.float32))
-        self.history: list[dict] = []
+        self.trust_highlights = False
+        self.lobes: torch.Tensor | None = None
         self.state = self._start()
-        self._set_resolution(settings.resolutions[0])
+        self.set_resolution(settings.resolutions[0])
 
     # ------------------------------------------------------------------ set-up
     def _start(self) -> State:
@@ -120,22 +123,42 @@ class AppearanceSolver:
         log_light = np.broadcast_to(np.log(irradiance / open_share), (6 * self.settings.resolutions[0] ** 2, 3)).copy()
         points, nodes = len(self.capture.points), len(self.capture.nodes.points)
         specular = self.settings.specular_prior[0] if self.settings.specular else 0.0
-        return State(log_light, specular, self.settings.roughness, np.tile(albedo, (points, 1)), np.tile(albedo, (nodes, 1)))
+        everywhere = (np.tile(albedo, (count, 1)) for count in (points, nodes))
+        return State(log_light, specular, self.settings.roughness, *everywhere)
 
     def _skin(self) -> torch.Tensor:
         return torch.from_numpy(self.capture.skin.astype(np.float32))[None, :, None]
 
-    def _set_resolution(self, resolution: int) -> None:
+    def set_resolution(self, resolution: int) -> None:
         self.frame_light = FrameLight(resolution, self.capture.directions, self.capture.world_from_head)
         if len(self.state.log_light) != self.frame_light.texels:
             self.state.log_light = resample_light(self.state.log_light, resolution)
+
+    def subset(self, index: slice) -> AppearanceSolver:
+        """A solver of some of the points that shares the rest, with a state of its own."""
+        part = copy(self)
+        part.capture = replace(
+            self.capture,
+            points=self.capture.points.take(index),
+            samples=self.capture.samples.points(index),
+            transfer=self.capture.transfer.take(index),
+            skin=self.capture.skin[index],
+        )
+        part.state = replace(self.state, albedo=self.state.albedo[index])
+        part.colours, part.limits, part.trust, part.precision, part.baked = (
+            x[:, index] for x in (self.colours, self.limits, self.trust, self.precision, self.baked)
+        )
+        part.direct = self.direct[index]
+        part.table = LobeTable(part.capture.points.normals, part.capture.transfer.visibility(), self.capture.directions)
+        return part
 
     # ------------------------------------------------------------------ forward model
     def bake(self) -> None:
         """Transfer with all diffuse bounces for the present albedo [3, P, J], and the lobes for the roughness."""
         self.baked = self.direct[None].expand(3, -1, -1)
         if self.settings.bounce:
-            effective = self.state.node_albedo + self.state.specular * hemispherical_albedo(round(self.state.roughness, 3))
+            returned = self.state.specular * hemispherical_albedo(round(self.state.roughness, 3))
+            effective = self.state.node_albedo + returned
             radiosity = torch.from_numpy(node_radiosity(self.capture.node_transfer, effective)).float()
             node_direct = torch.from_numpy(self.capture.node_transfer.direct.astype(np.float32))
             bounce = torch.from_numpy(self.capture.transfer.bounce.astype(np.float32))
@@ -162,6 +185,11 @@ class AppearanceSolver:
     def reflect(self, along: torch.Tensor) -> torch.Tensor:
         frames = along.permute(1, 0, 2).to(torch.bfloat16).contiguous()
         return torch.bmm(self.lobes, frames).float().permute(2, 1, 0)
+
+    def model(self, irradiance: torch.Tensor, reflection: torch.Tensor) -> torch.Tensor:
+        """Radiance [3, P, F] for the present albedo and specular intensity."""
+        albedo = torch.from_numpy(np.ascontiguousarray(self.state.albedo.T, np.float32))[..., None]
+        return albedo * irradiance + self.state.specular * reflection
 
     def reflect_adjoint(self, values: torch.Tensor) -> torch.Tensor:
         """Transpose of the lobe sums: [3, P, F] -> [J, F, 3]."""
@@ -191,26 +219,42 @@ class AppearanceSolver:
         scale = error[used & ~satisfied].median().clamp_min(0.05) / 0.4549
         return weight * (~satisfied) / (1.0 + error / (6.0 * scale))
 
-    def eliminate(self, irradiance, reflection, weight) -> torch.Tensor:
-        """Albedo [3, P, 1] that fits best given light and specular intensity, from the fitted frames."""
+    def eliminate(self, irradiance, reflection, weight, specular: float | None = None) -> torch.Tensor:
+        """Albedo [3, P, 1] that fits best given light and specular intensity (the state's when None), from the
+        fitted frames.
+
+        A weak pull to the skin's mean albedo decides where no sample says anything.
+        """
         weight = weight * self.fitted
-        moment = (weight * irradiance * (self.colours - self.state.specular * reflection)).sum(2, keepdim=True)
-        albedo = moment / ((weight * irradiance * irradiance).sum(2, keepdim=True) + 1e-3)
+        specular = self.state.specular if specular is None else specular
+        moment = (weight * irradiance * (self.colours - specular * reflection)).sum(2, keepdim=True)
+        curvature = (weight * irradiance * irradiance).sum(2, keepdim=True)
+        albedo = (moment + ALBEDO_PULL * self.typical_albedo) / (curvature + ALBEDO_PULL)
         return albedo.clamp(MINIMUM_ALBEDO, MAXIMUM_ALBEDO)
 
-    def _off_albedo(self, values, irradiance, weight) -> torch.Tensor:
-        """values [3, P, F] minus the part along E that a change of albedo would absorb."""
-        along = (weight * irradiance * values).sum(2, keepdim=True)
-        return values - irradiance * along / ((weight * irradiance * irradiance).sum(2, keepdim=True) + 1e-3)
+    def off_albedo(self, values, irradiance, weight) -> torch.Tensor:
+        """values [3, P, F] minus the part along E that a change of albedo would absorb.
 
-    def fit_specular(self, irradiance, reflection, weight, evidence: float) -> float:
-        """Specular intensity in closed form with albedo eliminated, under its normal prior."""
+        Exactly orthogonal, without the pull on the albedo: highlights are some percent of the diffuse radiance, and
+        the least remainder of that would pass for them.
+        """
+        along = (weight * irradiance * values).sum(2, keepdim=True)
+        return values - irradiance * along / (weight * irradiance * irradiance).sum(2, keepdim=True).clamp_min(1e-6)
+
+    @property
+    def typical_albedo(self) -> torch.Tensor:
+        """[3, 1, 1]: the skin points' median albedo."""
+        median = np.median(self.state.albedo[self.capture.skin], axis=0)
+        return torch.from_numpy(median.astype(np.float32))[:, None, None]
+
+    def highlights(self, irradiance, reflection, weight) -> Highlights:
+        """What the samples say about the specular intensity, per channel, with albedo eliminated."""
         weight = weight * self.fitted
-        pure = self._off_albedo(reflection, irradiance, weight)
-        moment = float((weight * pure * self.colours).sum()) * evidence
-        curvature = float((weight * pure * reflection).sum()) * evidence
-        mean, sigma = self.settings.specular_prior
-        return float(np.clip((moment + mean / sigma**2) / (curvature + 1.0 / sigma**2), 0.0, 2.0))
+        pure = self.off_albedo(reflection, irradiance, weight)
+        moment, curvature = (weight * pure * self.colours).sum((1, 2)), (weight * pure * reflection).sum((1, 2))
+        share = (weight * self.colours).sum((1, 2)) / (weight * reflection).sum((1, 2))
+        intensity = (moment / curvature.clamp_min(1e-12)).double().numpy()
+        return Highlights(intensity, curvature.double().numpy() * self.evidence(weight), share.double().numpy())
 
     def evidence(self, weight: torch.Tensor) -> float:
         """Scales the data term so that its samples count as settings.independent ones of unit variance."""

@@ -11,9 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.envmap import cube_lookup, cube_smoothness, cube_solid_angles
-
-CHANNELS = 3
+from shared.envmap import cube_directions, cube_lookup, cube_smoothness, cube_solid_angles
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,5 @@ class FrameLight:
 
 def resample_light(log_light: np.ndarray, resolution: int) -> np.ndarray:
     """The log light [6 n^2, C] on a cubemap of another resolution, interpolated bilinearly."""
-    from shared.envmap import cube_directions
-
     source = round((len(log_light) / 6) ** 0.5)
     return cube_lookup(cube_directions(resolution), source) @ log_light

@@ -16,19 +16,21 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from shared.solve.appearance import ROUGHNESS_RANGE, AppearanceSolver, State
-from shared.solve.light import resample_light
-from shared.solve.scale import scale_prior
+from shared.solve.appearance import AppearanceSolver
+from shared.solve.scale import settle_scale
 
 _LARGEST_STEP = 1.5
 
 
-def conjugate_gradients(product: Callable, right: np.ndarray, diagonal: np.ndarray, count: int, tolerance: float = 0.02):
-    """Approximate solution of product(x) = right, preconditioned by a diagonal; at most count products."""
-    x = np.zeros_like(right)
-    residual = right.copy()
-    z = residual / diagonal
-    direction, power = z.copy(), float((residual * z).sum())
+def conjugate_gradients(
+    product: Callable, right: np.ndarray, count: int, tolerance: float = 0.02
+) -> np.ndarray:
+    """Approximate solution of product(x) = right by conjugate gradients, at most count products.
+
+    Ends when the residual has fallen by the tolerance.
+    """
+    x, residual = np.zeros_like(right), right.copy()
+    direction, power = residual.copy(), float((residual * residual).sum())
     first = power
     for _ in range(count):
         image = product(direction)
@@ -38,11 +40,10 @@ def conjugate_gradients(product: Callable, right: np.ndarray, diagonal: np.ndarr
         length = power / curvature
         x += length * direction
         residual -= length * image
-        z = residual / diagonal
-        power, last = float((residual * z).sum()), power
+        power, last = float((residual * residual).sum()), power
         if power <= tolerance**2 * first:
             break
-        direction = z + (power / last) * direction
+        direction = residual + (power / last) * direction
     return x
 
 
@@ -50,45 +51,62 @@ class LightStep:
     """The linearised problem at the solver's present state."""
 
     def __init__(self, solver: AppearanceSolver):
-        self.solver, state = solver, solver.state
-        self.light = state.light
+        self.solver = solver
+        self.light = solver.state.light
         self.irradiance, self.reflection = solver.forward(self.light)
-        albedo = _channel_column(state.albedo)
-        self.weight = solver.weights(albedo * self.irradiance + state.specular * self.reflection) * solver.fitted
+        self.weight = solver.weights(solver.model(self.irradiance, self.reflection)) * solver.fitted
         self.evidence = solver.evidence(self.weight)
-        self.refresh()
+        self.before = 0.0
+        self._fit_points()
 
-    def refresh(self) -> None:
-        """Albedo and specular intensity for the present light under fixed weights."""
+    def _fit_points(self) -> None:
         solver = self.solver
-        if solver.settings.specular:
-            args = (self.irradiance, self.reflection, self.weight)
-            solver.state.specular = solver.fit_specular(*args, self.evidence)
         self.albedo = solver.eliminate(self.irradiance, self.reflection, self.weight)
         solver.state.albedo = self.albedo[..., 0].T.double().numpy()
-        self.norm = (self.weight * self.irradiance.square()).sum(2, keepdim=True) + 1e-3
+        self.pure = solver.off_albedo(self.reflection, self.irradiance, self.weight)
+
+    def settle(self) -> None:
+        """Specular intensity, the light's scale and the albedo for the present light, weights as they were."""
+        solver, settings = self.solver, self.solver.settings
+        self.irradiance, self.reflection = solver.forward(solver.state.light)
+        self._fit_points()
+        log_albedo, log_irradiance, _ = solver.mean_on_skin(self.albedo, self.irradiance)
+        highlights = None
+        if solver.trust_highlights:
+            highlights = solver.highlights(self.irradiance, self.reflection, self.weight)
+        log_factor, specular = settle_scale(
+            log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma
+        )
+        factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]
+        solver.state.log_light = solver.state.log_light + log_factor
+        solver.state.specular = specular if settings.specular else 0.0
+        self.irradiance, self.reflection = self.irradiance * factor, self.reflection * factor
+        self._fit_points()
 
     def cost(self, log_light: np.ndarray) -> float:
-        """Data and priors with albedo eliminated, weights and specular intensity held."""
+        """Data and priors with albedo and, once highlights count, specular intensity eliminated; weights held."""
         solver = self.solver
         irradiance, reflection = solver.forward(np.exp(log_light))
-        albedo = solver.eliminate(irradiance, reflection, self.weight)
-        model = albedo * irradiance + solver.state.specular * reflection
+        specular = solver.state.specular
+        if solver.trust_highlights:
+            specular = solver.highlights(irradiance, reflection, self.weight).pooled
+        albedo = solver.eliminate(irradiance, reflection, self.weight, specular)
+        model = albedo * irradiance + specular * reflection
         data = 0.5 * self.evidence * float((self.weight * (model - solver.colours).square()).sum())
-        prior = solver.frame_light.prior(log_light, solver.settings.priors)[0]
-        log_albedo, log_irradiance, _ = solver.mean_on_skin(albedo, irradiance)
-        matrix, right = scale_prior(log_albedo + log_irradiance, solver.settings.white_sigma)
-        return data + prior + 0.5 * float(((matrix @ log_irradiance - right) ** 2).sum())
+        return data + solver.frame_light.prior(log_light, solver.settings.priors)[0]
 
     def _render(self, change: np.ndarray) -> torch.Tensor:
-        """Change of the model [3, P, F] for a change of log light [K, 3], off the albedo's reach."""
+        """Change of the model [3, P, F] for a change of log light [K, 3], out of the eliminated unknowns' reach."""
         solver = self.solver
         along = torch.from_numpy(solver.frame_light.along(self.light * change))
         result = self.albedo * torch.bmm(solver.baked, along.permute(2, 0, 1).contiguous())
         if solver.settings.specular:
             result += solver.state.specular * solver.reflect(along)
-        part = (self.weight * self.irradiance * result).sum(2, keepdim=True) / self.norm
-        return result - self.irradiance * part
+        result = solver.off_albedo(result, self.irradiance, self.weight)
+        if solver.trust_highlights:
+            weighted = self.weight * self.pure
+            result -= self.pure * ((weighted * result).sum() / (weighted * self.pure).sum().clamp_min(1e-12))
+        return result
 
     def _adjoint(self, values: torch.Tensor) -> np.ndarray:
         """Transpose of the unprojected rendering: [3, P, F] -> [K, 3]."""
@@ -103,36 +121,37 @@ class LightStep:
         solver, state = self.solver, self.solver.state
         error = self.albedo * self.irradiance + state.specular * self.reflection - solver.colours
         data = self.evidence * self._adjoint(self.weight * error)
-        log_albedo, log_irradiance, gauge = solver.mean_on_skin(self.albedo, self.irradiance)
-        self.gauge = self.light * gauge
-        self.scale_matrix, right = scale_prior(log_albedo + log_irradiance, solver.settings.white_sigma)
-        scale = self.gauge * (self.scale_matrix.T @ (self.scale_matrix @ log_irradiance - right))
         _, prior, self.prior_product = solver.frame_light.prior(state.log_light, solver.settings.priors)
-        return data + prior + scale
+        return data + prior
 
     def product(self, change: np.ndarray) -> np.ndarray:
         """Gauss-Newton Hessian times a change [K, 3]."""
-        data = self.evidence * self._adjoint(self.weight * self._render(change))
-        shift = (self.gauge * change).sum(0)
-        return data + self.prior_product(change) + self.gauge * (self.scale_matrix.T @ (self.scale_matrix @ shift))
+        return self.evidence * self._adjoint(self.weight * self._render(change)) + self.prior_product(change)
 
     def take(self, products: int = 15) -> None:
-        """Moves the solver's log light: a damped step, halved until the cost falls."""
+        """Moves the solver's log light at constant mean irradiance per channel; halved until the cost falls.
+
+        The scale is left to settle: steps x are taken as Q x with Q = 1 - 1 g', where g is the derivative of the log
+        mean irradiance (it sums to 1), so that g' Q x = 0.
+        """
         state = self.solver.state
-        gradient = self.gradient()
-        diagonal = np.full_like(gradient, self.solver.settings.priors.smooth * 4.0 + 1e-3)
-        diagonal += np.abs(self.gauge) * self.evidence
-        step = conjugate_gradients(self.product, -gradient, diagonal, products)
+        gauge = self.light * self.solver.mean_on_skin(self.albedo, self.irradiance)[2]
+
+        def level(change: np.ndarray) -> np.ndarray:
+            return change - (gauge * change).sum(0)
+
+        def level_transposed(change: np.ndarray) -> np.ndarray:
+            return change - gauge * change.sum(0)
+
+        right = -level_transposed(self.gradient())
+        solved = conjugate_gradients(lambda x: level_transposed(self.product(level(x))), right, products)
+        step = level(solved)
         step *= min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-9))
-        before = self.cost(state.log_light)
+        self.before = self.cost(state.log_light)
         for _ in range(6):
-            if self.cost(state.log_light + step) < before:
+            if self.cost(state.log_light + step) < self.before:
                 break
             step *= 0.5
         else:
             step *= 0.0
         state.log_light = state.log_light + step
-
-
-def _channel_column(albedo: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(albedo.T, np.float32))[..., None]

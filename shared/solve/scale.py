@@ -19,6 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from shared.color import LUMINANCE
 
@@ -38,6 +39,22 @@ REFERENCE_SKINS = np.array(
 
 LUMINANCE_SIGMA = 0.45
 WHITE_SIGMA = 0.15
+HIGHLIGHT_SIGMA = 0.08
+
+
+@dataclass(frozen=True)
+class Highlights:
+    """Per channel [3]: the specular intensity that fits best with the light as it is, the precision of that, and the
+    diffuse radiance relative to the specular one, by which errors of the diffuse model are magnified."""
+
+    intensity: np.ndarray
+    precision: np.ndarray
+    diffuse_share: np.ndarray
+
+    @property
+    def pooled(self) -> float:
+        """The one intensity that fits all channels best."""
+        return float((self.intensity * self.precision).sum() / max(self.precision.sum(), 1e-12))
 
 
 @dataclass(frozen=True)
@@ -90,3 +107,34 @@ def most_likely_irradiance(log_radiance: np.ndarray, white_sigma: float = WHITE_
     """u [3]: the log mean irradiance that the priors alone prefer for skin of log mean radiance y [3]."""
     matrix, right = scale_prior(log_radiance, white_sigma)
     return np.linalg.lstsq(matrix, right, rcond=None)[0]
+
+
+def settle_scale(
+    log_albedo: np.ndarray,
+    log_irradiance: np.ndarray,
+    highlights: Highlights | None,
+    specular_prior: tuple[float, float],
+    white_sigma: float = WHITE_SIGMA,
+) -> tuple[np.ndarray, float]:
+    """The factor on the light per channel and the specular intensity that are jointly most likely.
+
+    The lobe returns the light's own colour and its strength has a known range, so highlights say something about the
+    scale that diffuse skin cannot: with the light multiplied by k, channel c wants s k_c = t_c. log_albedo,
+    log_irradiance [3] are the skin's present means; specular_prior: mean of s and standard deviation of its logarithm.
+    -> log k [3], and s as the samples want it under that k (the prior's mean without highlights).
+    """
+    matrix, right = scale_prior(log_albedo + log_irradiance, white_sigma)
+    mean, sigma = specular_prior
+    if highlights is None:
+        return np.linalg.lstsq(matrix, right - matrix @ log_irradiance, rcond=None)[0], mean
+    best = np.clip(highlights.intensity, 0.05, 2.0)
+    spread = HIGHLIGHT_SIGMA * highlights.diffuse_share / highlights.diffuse_share.mean()
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        amplitude = (x[3] + x[:3] - np.log(best)) / spread
+        return np.concatenate([matrix @ (log_irradiance + x[:3]) - right, amplitude, [(x[3] - np.log(mean)) / sigma]])
+
+    log_factor = least_squares(residuals, np.array([0.0, 0.0, 0.0, np.log(mean)]), method="lm").x[:3]
+    factor, precision = np.exp(log_factor), highlights.precision
+    specular = (precision * factor * best).sum() / max((precision * factor**2).sum(), 1e-12)
+    return log_factor, float(np.clip(specular, 0.0, 2.0))

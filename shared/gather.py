@@ -1,0 +1,191 @@
+"""From frames to samples at surface points: what the camera sees of each point, and how far to trust it.
+
+One frame at a time goes through, so memory does not grow with the clip. A sample is trusted by the square of its view
+cosine and by its distance to the mask's border; points close to an occlusion edge count as hidden, since a small pose
+or shape error would read another surface there. Clipped and crushed channels are kept and marked: they say "at least"
+and "at most" (censored data), which still bounds the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import scipy.sparse as sparse
+
+from shared.geometry import project
+from shared.mesh import Mesh, face_normals, vertex_normals
+from shared.raycast import RayScene
+
+CLIPPED_CODE = 0.98
+CRUSHED_CODE = 0.012
+MINIMUM_VIEW_COSINE = 0.2
+_REMAP_COLUMNS = 1024
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A frame ready for sampling. levels: linear RGB [H, W, 3] and halved copies of it; limits: per level int8
+    [H, W, 3], +1 where the channel is clipped, -1 where crushed; inside [H, W]: 0 at the mask's border to 1 within."""
+
+    levels: tuple[np.ndarray, ...]
+    limits: np.ndarray
+    inside: np.ndarray
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera's view of V points: pixels [V, 2], depth [V] mm, cosine [V] between normal and view direction,
+    towards_camera [V, 3] unit, weight [V] (0: not seen)."""
+
+    pixels: np.ndarray
+    depth: np.ndarray
+    cosine: np.ndarray
+    towards_camera: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Colours [P, F, 3] of P points in F frames, weight [P, F] (0: not seen), limits int8 [P, F, 3] (+1: the truth is
+    at least the colour, -1: at most), towards_camera [P, F, 3] unit vectors in head space."""
+
+    colours: np.ndarray
+    weight: np.ndarray
+    limits: np.ndarray
+    towards_camera: np.ndarray
+
+    def frames(self, index: np.ndarray) -> Samples:
+        """The samples of some frames."""
+        return Samples(
+            self.colours[:, index], self.weight[:, index], self.limits[:, index], self.towards_camera[:, index]
+        )
+
+    def points(self, index: np.ndarray) -> Samples:
+        """The samples of some points."""
+        return Samples(self.colours[index], self.weight[index], self.limits[index], self.towards_camera[index])
+
+
+class SurfaceViewer:
+    """A mesh as cameras see it: vertex visibility by rays, eroded by a margin on the surface."""
+
+    def __init__(self, mesh: Mesh, scene: RayScene, margin_mm: float = 2.0, offset: float = 0.05):
+        self.mesh, self.scene, self.offset = mesh, scene, offset
+        self.normals = vertex_normals(mesh.vertices, mesh.faces)
+        faces = mesh.faces
+        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        length = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
+        self.rings = max(1, round(margin_mm / float(np.median(length))))
+        shape = (len(mesh.vertices),) * 2
+        adjacency = sparse.coo_matrix((np.ones(len(edges), np.float32), edges.T), shape=shape).tocsr()
+        self._adjacency = adjacency + adjacency.T
+
+    def view(self, camera_from_head: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]) -> View:
+        """All vertices in one camera. size: (width, height) of the picture in pixels."""
+        vertices = self.mesh.vertices
+        pixels, depth = project(vertices, camera_from_head, intrinsics)
+        centre = -camera_from_head[:3, 3] @ camera_from_head[:3, :3]
+        towards = centre - vertices
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        cosine = (towards * self.normals).sum(1)
+        within = ((pixels > 1.0) & (pixels < np.array(size) - 1.0)).all(1) & (depth > 0)
+        seen = within & (cosine > MINIMUM_VIEW_COSINE)
+        index = np.nonzero(seen)[0]
+        origins = vertices[index] + self.offset * self.normals[index]
+        hidden = index[self.scene.occluded(origins, towards[index])]
+        weight = np.where(seen, cosine**2, 0.0)
+        weight[self._grow(hidden)] = 0.0
+        return View(pixels, depth, cosine, towards, weight.astype(np.float32))
+
+    def _grow(self, hidden: np.ndarray) -> np.ndarray:
+        """[V] bool: the hidden vertices and their neighbours over the margin."""
+        grown = np.zeros(len(self.mesh.vertices), np.float32)
+        grown[hidden] = 1.0
+        for _ in range(self.rings):
+            grown = np.minimum(grown + self._adjacency @ grown, 1.0)
+        return grown > 0
+
+
+def prepare_picture(codes: np.ndarray, linear: np.ndarray, mask: np.ndarray, border_px: float = 3.0) -> Picture:
+    """codes [H, W, 3] uint8 or uint16, linear [H, W, 3] float32, mask [H, W] (0: background) -> Picture."""
+    maximum = np.iinfo(codes.dtype).max
+    limits = (codes >= CLIPPED_CODE * maximum).astype(np.int8) - (codes <= CRUSHED_CODE * maximum).astype(np.int8)
+    distance = cv2.distanceTransform((mask > 0).astype(np.uint8), cv2.DIST_L2, 3)
+    inside = np.clip((distance - 1.0) / border_px, 0.0, 1.0)
+    levels = [np.ascontiguousarray(linear, np.float32)]
+    while min(levels[-1].shape[:2]) >= 64:
+        height, width = levels[-1].shape[:2]
+        levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+    return Picture(tuple(levels), limits, inside.astype(np.float32))
+
+
+def _remap(image: np.ndarray, pixels: np.ndarray, interpolation: int) -> np.ndarray:
+    """image [H, W, ...] at pixels [N, 2] (first centre at 0.5) -> [N, ...]; the border is repeated."""
+    count = len(pixels)
+    rows = -(-count // _REMAP_COLUMNS)
+    grid = np.zeros((rows * _REMAP_COLUMNS, 2), np.float32)
+    grid[:count] = pixels - 0.5
+    grid = grid.reshape(rows, _REMAP_COLUMNS, 2)
+    found = cv2.remap(image, grid[..., 0].copy(), grid[..., 1].copy(), interpolation, borderMode=cv2.BORDER_REPLICATE)
+    return found.reshape((rows * _REMAP_COLUMNS,) + image.shape[2:])[:count]
+
+
+def sample_colours(picture: Picture, pixels: np.ndarray, footprint: np.ndarray | None = None) -> np.ndarray:
+    """[N, 2] pixels -> [N, 3] linear RGB. footprint [N]: width in pixels that a sample stands for.
+
+    Footprints up to one pixel are interpolated bicubically; wider ones blend the two nearest levels of the pyramid
+    (trilinear), so that a coarse map is filtered instead of aliased.
+    """
+    colours = np.maximum(_remap(picture.levels[0], pixels, cv2.INTER_CUBIC), 0.0)
+    if footprint is None or float(footprint.max(initial=0.0)) <= 1.0:
+        return colours
+    level = np.clip(np.log2(np.maximum(footprint, 1.0)), 0.0, len(picture.levels) - 1.0)
+    below = np.minimum(level.astype(int), len(picture.levels) - 2)
+    full = np.array(picture.levels[0].shape[1::-1], np.float64)
+    stack = [colours]
+    for image in picture.levels[1 : below.max() + 2]:
+        stack.append(_remap(image, pixels * (np.array(image.shape[1::-1]) / full), cv2.INTER_LINEAR))
+    stack = np.stack(stack)
+    index, blend = np.arange(len(pixels)), (level - below)[:, None].astype(np.float32)
+    return stack[below, index] * (1.0 - blend) + stack[below + 1, index] * blend
+
+
+def sample_limits(picture: Picture, pixels: np.ndarray) -> np.ndarray:
+    """[N, 2] -> int8 [N, 3]: +1 or -1 where a pixel that the sample reads is clipped or crushed."""
+    found = _remap(picture.limits.astype(np.float32), pixels, cv2.INTER_LINEAR)
+    return (found > 0.1).astype(np.int8) - (found < -0.5).astype(np.int8)
+
+
+def sample_inside(picture: Picture, pixels: np.ndarray) -> np.ndarray:
+    """[N, 2] -> [N] float32 trust by distance from the mask's border, 0 outside."""
+    return _remap(picture.inside, pixels, cv2.INTER_LINEAR)
+
+
+def gather_samples(
+    viewer: SurfaceViewer, index: np.ndarray, pictures, camera_from_head: np.ndarray, intrinsics: np.ndarray
+) -> Samples:
+    """Samples of the vertices index [P] in F frames.
+
+    pictures: iterable of F Picture, read once in order; camera_from_head [F, 4, 4]; intrinsics [3, 3] of the pictures.
+    """
+    shape = (len(index), len(camera_from_head))
+    colours, limits = np.zeros(shape + (3,), np.float32), np.zeros(shape + (3,), np.int8)
+    weight, towards = np.zeros(shape, np.float32), np.zeros(shape + (3,), np.float32)
+    for f, picture in enumerate(pictures):
+        view = viewer.view(camera_from_head[f], intrinsics, picture.inside.shape[::-1])
+        towards[:, f] = view.towards_camera[index]
+        seen = np.nonzero(view.weight[index] > 0)[0]
+        pixels = view.pixels[index[seen]]
+        colours[seen, f] = sample_colours(picture, pixels)
+        limits[seen, f] = sample_limits(picture, pixels)
+        weight[seen, f] = view.weight[index[seen]] * sample_inside(picture, pixels)
+    return Samples(colours, weight, limits, towards)
+
+
+def texel_size(mesh: Mesh, size: int) -> np.ndarray:
+    """[F] edge of a texel of a size x size map on each face, mm: sqrt(area on the surface / area in texels)."""
+    a, b, c = (mesh.uvs[mesh.face_uvs[:, k]] * size for k in range(3))
+    texels = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    area = 0.5 * np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1)
+    return np.sqrt(area / np.maximum(texels, 1e-9))

@@ -1,0 +1,147 @@
+"""Irradiance and reflection at a mesh's vertices in every frame, for the texture pass and for re-rendering.
+
+Vertices that no frame faces are left out. Irradiance (with bounces) of all frames is one product, kept as half floats
+(6 bytes per vertex and frame); lobe sums depend on the camera and are made for
+key frames, a few degrees of turn apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.brdf import hemispherical_albedo
+from shared.envmap import cube_lookup
+from shared.geometry import camera_centres, vector_from_rotation, world_from_head
+from shared.lobes import LobeTable, specular_reflection
+from shared.mesh import normalised
+from shared.transfer import Points, Transfer, irradiance, node_radiosity
+
+KEY_STEP = 0.05
+"""Radians between frames whose lobe sums are computed (3 degrees)."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """What bounces need to know of the surface: node_albedo [K, 3], mean specular_intensity, roughness."""
+
+    node_albedo: np.ndarray
+    specular_intensity: float
+    roughness: float
+
+    def bounce_albedo(self) -> np.ndarray:
+        """[K, 3] fraction of light that a node sends on, its specular share included as if it were diffuse."""
+        return self.node_albedo + self.specular_intensity * hemispherical_albedo(round(self.roughness, 3))
+
+
+class VertexShading:
+    """E and S of V vertices under one cubemap light in F frames.
+
+    index [P]: the vertices that are shaded, out of count; points, transfer [P]: theirs; node_transfer: the nodes';
+    light [6 n^2, 3]; directions [J, 3]; camera_from_head [F, 4, 4]; moves: "head" or "camera"; bounce: count light
+    that bounced; key_step: largest turn between two frames whose reflections are computed, radians.
+    """
+
+    def __init__(
+        self,
+        index: np.ndarray,
+        count: int,
+        points: Points,
+        transfer: Transfer,
+        node_transfer: Transfer,
+        material: Material,
+        light: np.ndarray,
+        directions: np.ndarray,
+        camera_from_head: np.ndarray,
+        moves: str,
+        bounce: bool = True,
+        key_step: float = KEY_STEP,
+    ):
+        self.index, self.count, self.material, self.directions = index, count, material, directions
+        self.points, self.transfer = points, transfer
+        self.light_along = light_along(light, directions, world_from_head(camera_from_head, moves))
+        flat = self.light_along.reshape(len(directions), -1)
+        radiosity = _radiosity(node_transfer, material, self.light_along) if bounce else None
+        shape = (len(index), len(camera_from_head), 3)
+        direct = irradiance(transfer, flat)
+        total = irradiance(transfer, flat, radiosity) if bounce else direct
+        self._irradiance = total.reshape(shape).astype(np.float16)
+        self._bounced = (total - direct).reshape(shape).astype(np.float16)
+        self._table = LobeTable(points.normals, transfer.visibility(), directions)
+        self._centres = camera_centres(camera_from_head)
+        self._turn = turned_so_far(camera_from_head)
+        self._keys = key_frames(self._turn, key_step)
+        self._key_reflection: dict[int, np.ndarray] = {}
+
+    def irradiance(self, frame: int) -> np.ndarray:
+        """E [V, 3] float32 over pi, zero at vertices that are not shaded."""
+        result = np.zeros((self.count, 3), np.float32)
+        result[self.index] = self._irradiance[:, frame]
+        return result
+
+    def reflection(self, frame: int) -> np.ndarray:
+        """S [V, 3] float32 at specular_intensity 1, between the two key frames around this one.
+
+        Lobes of skin are 20 degrees wide and more: linear interpolation over a turn of three is exact to 1 % of them.
+        """
+        after = int(np.searchsorted(self._keys, frame))
+        high = int(self._keys[after])
+        low = high if high == frame else int(self._keys[after - 1])
+        share = (self._turn[frame] - self._turn[low]) / max(self._turn[high] - self._turn[low], 1e-12)
+        value = self._at_key(low).astype(np.float32)
+        if high != low:
+            value += np.float32(share) * (self._at_key(high).astype(np.float32) - value)
+        result = np.zeros((self.count, 3), np.float32)
+        result[self.index] = value
+        return result
+
+    def _at_key(self, frame: int) -> np.ndarray:
+        """S of the shaded vertices in one frame [P, 3], half floats; made once."""
+        if frame not in self._key_reflection:
+            towards = normalised(self._centres[frame] - self.points.positions)
+            blocked = self._bounced[:, frame].astype(np.float32) / np.maximum(self.transfer.blocked, 1e-3)[:, None]
+            facing = np.nonzero((towards * self.points.normals).sum(1) > -0.1)[0]
+            value = np.zeros((len(self.points), 3), np.float16)
+            value[facing] = specular_reflection(
+                self._table.take(facing),
+                towards[facing],
+                self.material.roughness,
+                self.light_along[:, frame],
+                blocked[facing],
+            )
+            self._key_reflection[frame] = value
+        return self._key_reflection[frame]
+
+
+def turned_so_far(camera_from_head: np.ndarray) -> np.ndarray:
+    """[F, 4, 4] -> [F] angle that the head has turned against the camera from frame to frame, added up, radians."""
+    rotation = camera_from_head[:, :3, :3]
+    step = vector_from_rotation(np.einsum("fij,fkj->fik", rotation[1:], rotation[:-1]))
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(step, axis=1))])
+
+
+def key_frames(turn: np.ndarray, step: float) -> np.ndarray:
+    """Indices of frames no more than step apart in the accumulated turn [F] where frames are dense enough; the first
+    and the last are always among them."""
+    keys = [0]
+    for frame in range(1, len(turn)):
+        if turn[frame] - turn[keys[-1]] > step and frame - 1 > keys[-1]:
+            keys.append(frame - 1)
+    return np.unique([*keys, len(turn) - 1])
+
+
+def light_along(light: np.ndarray, directions: np.ndarray, world_from_head: np.ndarray) -> np.ndarray:
+    """Cubemap [6 n^2, C] along head-space directions [J, 3] in F frames -> [J, F, C] float32."""
+    resolution = round((len(light) / 6) ** 0.5)
+    turned = np.einsum("fij,dj->dfi", world_from_head, directions).reshape(-1, 3)
+    values = cube_lookup(turned, resolution) @ np.asarray(light, np.float64)
+    return values.astype(np.float32).reshape(len(directions), len(world_from_head), -1)
+
+
+def _radiosity(nodes: Transfer, material: Material, along: np.ndarray) -> np.ndarray:
+    """[K, F * 3]: what the nodes send out, over pi, with all diffuse bounces."""
+    matrices = node_radiosity(nodes, material.bounce_albedo())
+    direct = nodes.direct.astype(np.float32)
+    per_channel = [matrices[..., c].astype(np.float32) @ (direct @ along[..., c]) for c in range(along.shape[-1])]
+    return np.stack(per_channel, axis=-1).reshape(len(direct), -1)

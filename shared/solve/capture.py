@@ -1,0 +1,104 @@
+"""Sets up the appearance fit: which points, frames and directions it looks at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.gather import Picture, SurfaceViewer, gather_samples
+from shared.geometry import fibonacci_sphere, world_from_head
+from shared.solve.appearance import Capture
+from shared.transfer import Nodes, Transfer, bounce_nodes, mesh_points, spread_vertices, trace_transfer
+
+MINIMUM_FRAMES = 4
+_DEEP = 0.9
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """points on the surface, directions over the sphere, nodes that bounce light."""
+
+    points: int = 4000
+    directions: int = 768
+    nodes: int = 1000
+
+
+@dataclass(frozen=True)
+class Scenery:
+    """What does not depend on the frames: directions [J, 3], bounce nodes and their transfer."""
+
+    directions: np.ndarray
+    nodes: Nodes
+    node_transfer: Transfer
+
+
+def set_scenery(viewer: SurfaceViewer, sizes: Sizes) -> Scenery:
+    """Directions and bounce nodes of a mesh, traced."""
+    directions = fibonacci_sphere(sizes.directions)
+    nodes = bounce_nodes(viewer.mesh, sizes.nodes)
+    return Scenery(directions, nodes, trace_transfer(viewer.scene, nodes.points, nodes, directions))
+
+
+def spread_frames(count: int, wanted: int) -> np.ndarray:
+    """At most wanted indices, evenly over range(count)."""
+    return np.unique(np.round(np.linspace(0, count - 1, min(wanted, count))).astype(int))
+
+
+def hold_out(count: int, every: int) -> np.ndarray:
+    """[count] bool, True for fitted frames: every every-th frame is held out, starting in the middle of a period."""
+    index = np.arange(count)
+    return (index % every != every // 2) if count > every else index >= 0
+
+
+def face_front(viewer: SurfaceViewer, camera_from_head: np.ndarray, limit: float) -> np.ndarray:
+    """[V] bool: vertices that turn towards the camera in some frame, by more than the cosine limit."""
+    rotation, translation = camera_from_head[:, :3, :3], camera_from_head[:, :3, 3]
+    centres = -np.einsum("fji,fj->fi", rotation, translation)
+    found = np.zeros(len(viewer.mesh.vertices), bool)
+    for centre in centres[spread_frames(len(centres), 40)]:
+        towards = centre - viewer.mesh.vertices
+        cosine = (towards * viewer.normals).sum(1) / np.linalg.norm(towards, axis=1)
+        found |= cosine > limit
+    return found
+
+
+def build_capture(
+    viewer: SurfaceViewer,
+    scenery: Scenery,
+    pictures: Iterable[Picture],
+    camera_from_head: np.ndarray,
+    intrinsics: np.ndarray,
+    moves: str,
+    fitted: np.ndarray,
+    allowed: np.ndarray,
+    skin: np.ndarray,
+    count: int,
+    progress: Callable = iter,
+) -> Capture:
+    """Samples and transfer of at most count vertices in F frames.
+
+    pictures: the F frames in order; camera_from_head [F, 4, 4]; fitted [F]; allowed, skin [V] bool: vertices that may
+    be chosen, and where the prior on skin reflectance applies. Vertices seen in fewer than MINIMUM_FRAMES fitted frames
+    or deep inside the mesh are left out.
+    """
+    front = allowed & face_front(viewer, camera_from_head, 0.2)
+    index = spread_vertices(viewer.mesh.vertices, count, front)
+    samples = gather_samples(viewer, index, pictures, camera_from_head, intrinsics)
+    seen = (samples.weight[:, fitted] > 0).sum(1) >= min(MINIMUM_FRAMES, int(fitted.sum()))
+    points = mesh_points(viewer.mesh, index[seen])
+    transfer = trace_transfer(viewer.scene, points, scenery.nodes, scenery.directions, progress=progress)
+    shallow = np.nonzero(transfer.blocked < _DEEP)[0]
+    chosen = np.nonzero(seen)[0][shallow]
+    return Capture(
+        points=points.take(shallow),
+        samples=samples.points(chosen),
+        transfer=transfer.take(shallow),
+        nodes=scenery.nodes,
+        node_transfer=scenery.node_transfer,
+        directions=scenery.directions,
+        world_from_head=world_from_head(camera_from_head, moves),
+        fitted=fitted,
+        skin=skin[index[chosen]],
+    )

@@ -1,0 +1,112 @@
+"""The whole appearance fit: light steps from coarse to fine, roughness by line search, a stop on held-out frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from shared.solve.appearance import AppearanceSolver, Capture, Settings, State
+from shared.solve.light_step import LightStep
+
+ROUGHNESS_RANGE = (0.25, 0.7)
+SHAPING_STEPS = 3
+ROUGHNESS_STEPS = (2, 3)
+_ROUGHNESS_FACTOR = 1.18
+_WORTHWHILE = 0.003
+"""A step that lowers the held-out residual by less than this fraction is the last of its resolution."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The best State by held-out residual; iterations: one record per step; fitted and held_out: its residuals."""
+
+    state: State
+    iterations: tuple[dict, ...]
+    fitted: float
+    held_out: float
+
+
+def fit_appearance(
+    capture: Capture, settings: Settings, report: Callable[[dict], None] = lambda record: None
+) -> Solution:
+    """Fits light, albedo, specular intensity and roughness; report receives each step's record.
+
+    The first steps only give the light its shape; highlights, which then begin to say something about scale and
+    roughness, take part from the fourth. Only states after that can win.
+    """
+    solver = AppearanceSolver(capture, settings)
+    judges = not capture.fitted.all()  # a clip too short to hold frames out is judged by the fitted ones
+    records, best = [], None
+    for stage, resolution in enumerate(settings.resolutions):
+        solver.set_resolution(resolution)
+        last, least = np.inf, SHAPING_STEPS + 2 if stage == 0 else 1
+        for number in range(settings.steps):
+            shaping = stage == 0 and number < min(SHAPING_STEPS, settings.steps - 1)
+            record = _step(solver, settings, shaping) | {"resolution": resolution, "step": number}
+            records.append(record)
+            report(record)
+            judged = record["held_out" if judges else "fitted"]
+            if not shaping and (best is None or judged < best[0]):
+                best = (judged, record, _copy(solver.state))
+            if not shaping and number >= least and judged > last * (1.0 - _WORTHWHILE):
+                break
+            last = judged if not shaping else np.inf
+            if settings.specular and settings.search_roughness and stage == 0 and number in ROUGHNESS_STEPS:
+                solver.state.roughness = search_roughness(solver)
+                solver.lobes = None
+    return Solution(best[2], tuple(records), best[1]["fitted"], best[1]["held_out"])
+
+
+def _step(solver: AppearanceSolver, settings: Settings, shaping: bool) -> dict:
+    """One step of everything; highlights say nothing about the scale before the light has taken shape."""
+    solver.trust_highlights = settings.specular and not shaping
+    solver.bake()
+    if settings.specular and solver.lobes is None:
+        solver.bake_lobes()
+    step = LightStep(solver)
+    step.take()
+    step.settle()
+    state = solver.state
+    state.node_albedo = state.albedo[solver.node_to_point]
+    fitted, held_out = solver.residuals(solver.model(step.irradiance, step.reflection))
+    return {
+        "fitted": fitted,
+        "held_out": held_out,
+        "cost": step.before,
+        "specular_intensity": state.specular,
+        "roughness": state.roughness,
+    }
+
+
+def _copy(state: State) -> State:
+    return replace(state, log_light=state.log_light.copy(), albedo=state.albedo.copy())
+
+
+def search_roughness(solver: AppearanceSolver, stride: int = 4) -> float:
+    """Three roughnesses around the present one on a subset of points, the parabola's minimum in the logarithm."""
+    subset = solver.subset(slice(None, None, stride))
+    subset.bake_lobes()
+    weight = subset.weights(subset.model(*subset.forward(subset.state.light))) * subset.fitted
+    logs = np.log(solver.state.roughness) + np.log(_ROUGHNESS_FACTOR) * np.array([-1.0, 0.0, 1.0])
+    costs = [_roughness_cost(subset, float(np.exp(value)), weight) for value in logs]
+    curvature = costs[0] - 2.0 * costs[1] + costs[2]
+    if curvature <= 0.0:
+        best = logs[int(np.argmin(costs))]
+    else:
+        offset = np.clip(0.5 * (costs[0] - costs[2]) / curvature, -1.5, 1.5)
+        best = logs[1] + offset * np.log(_ROUGHNESS_FACTOR)
+    return float(np.clip(np.exp(best), *ROUGHNESS_RANGE))
+
+
+def _roughness_cost(solver: AppearanceSolver, roughness: float, weight: torch.Tensor) -> float:
+    """Weighted squared residual with albedo and specular intensity refitted under fixed weights."""
+    solver.state.roughness = roughness
+    solver.bake_lobes()
+    irradiance, reflection = solver.forward(solver.state.light)
+    solver.state.specular = solver.highlights(irradiance, reflection, weight).pooled
+    albedo = solver.eliminate(irradiance, reflection, weight)
+    error = albedo * irradiance + solver.state.specular * reflection - solver.colours
+    return float((weight * error.square()).sum())

@@ -1,0 +1,222 @@
+"""Inverse rendering of a clip: appearance fit, then the texture pass, then the maps. Arrays in, arrays out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from shared.color import LUMINANCE
+from shared.gather import Picture, SurfaceViewer
+from shared.mesh import Mesh
+from shared.raycast import RayScene
+from shared.shading import Material, VertexShading
+from shared.solve.appearance import Settings
+from shared.solve.capture import (
+    Scenery,
+    Sizes,
+    build_capture,
+    face_front,
+    hold_out,
+    set_scenery,
+    spread_frames,
+)
+from shared.solve.fit_appearance import Solution, fit_appearance
+from shared.solve.texture import TexelMaterial
+from shared.solve.texture_pass import Clip, TexturePass
+from shared.texels import TexelSurface
+from shared.transfer import mesh_points, trace_transfer
+
+FACE_SKIN = ("forehead", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "chin", "jaw")
+"""Segments whose skin the light is solved from; hair, brows, lips, lids, eyes and what
+clothes may cover are left out."""
+
+PRIOR_SPREAD = 0.3
+"""Standard deviation of a texel's log albedo if all one knew were the person's mean: confidence compares with it."""
+
+
+class InverseInputs(Protocol):
+    """What the solver needs of a clip; shared.io.clip_inputs.ClipInputs is one.
+
+    picture(f): frame f of F ready for sampling; camera_from_head [F, 4, 4]; intrinsics [3, 3] and size (width, height)
+    of the pictures; moves: "head" or "camera"; face_segment [faces] or None where the mesh has no segments.
+    """
+
+    mesh: Mesh
+    camera_from_head: np.ndarray
+    intrinsics: np.ndarray
+    size: tuple[int, int]
+    moves: str
+    face_segment: np.ndarray | None
+    segment_names: tuple[str, ...]
+
+    def picture(self, f: int) -> Picture: ...
+
+
+@dataclass(frozen=True)
+class InverseSettings:
+    """sizes of the light's problem, its settings, frames it is solved from, edge of the maps, hold-out period."""
+
+    sizes: Sizes = field(default_factory=Sizes)
+    appearance: Settings = field(default_factory=Settings)
+    light_frames: int = 48
+    map_size: int = 1024
+    hold_out_every: int = 8
+
+
+@dataclass(frozen=True)
+class InverseResult:
+    """solution of the appearance fit, the texels' material, maps by name, the vertices' shading in all frames, the
+    viewer they belong to, and what is worth recording."""
+
+    solution: Solution
+    material: TexelMaterial
+    maps: dict[str, np.ndarray]
+    shading: VertexShading
+    viewer: SurfaceViewer
+    fitted: np.ndarray
+    record: dict
+
+
+def solve_clip(inputs: InverseInputs, settings: InverseSettings, progress: Callable, note: Callable) -> InverseResult:
+    """The whole of it. progress(items, label) wraps loops, note(text) logs a line."""
+    viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
+    scenery = set_scenery(viewer, settings.sizes)
+    fitted = hold_out(len(inputs.camera_from_head), settings.hold_out_every)
+    solution = _solve_light(inputs, settings, viewer, scenery, fitted, progress, note)
+    shading = shade_vertices(inputs, settings.appearance, viewer, scenery, solution, progress)
+    surface = TexelSurface(inputs.mesh, settings.map_size)
+    clip = Clip(inputs.picture, inputs.camera_from_head, inputs.intrinsics, fitted)
+    typical = np.median(solution.state.albedo, axis=0)
+    texture = TexturePass(surface, viewer, shading, clip, solution.state.specular, typical, progress=progress)
+    widths = (np.inf, settings.map_size / 16, settings.map_size / 64) if settings.appearance.specular else (np.inf,)
+    material, texture_record = texture.run(widths)
+    maps = make_maps(surface, material, solution.state.roughness)
+    return InverseResult(solution, material, maps, shading, viewer, fitted, {"texture": texture_record})
+
+
+def segment_vertices(inputs: InverseInputs, names: tuple[str, ...]) -> np.ndarray:
+    """[V] bool: vertices of faces in the named segments; all of them where the mesh has no segments."""
+    if inputs.face_segment is None:
+        return np.ones(len(inputs.mesh.vertices), bool)
+    wanted = [inputs.segment_names.index(name) for name in names if name in inputs.segment_names]
+    found = np.zeros(len(inputs.mesh.vertices), bool)
+    found[inputs.mesh.faces[np.isin(inputs.face_segment, wanted)]] = True
+    return found
+
+
+def _solve_light(inputs, settings, viewer, scenery: Scenery, fitted, progress, note) -> Solution:
+    chosen = spread_frames(len(inputs.camera_from_head), settings.light_frames)
+    # The light's own frames need held-out ones too: where thinning left too few, hold out among the thinned.
+    kept = fitted[chosen] if (~fitted[chosen]).sum() >= 2 else hold_out(len(chosen), settings.hold_out_every)
+    skin = segment_vertices(inputs, FACE_SKIN)
+    capture = build_capture(
+        viewer,
+        scenery,
+        (inputs.picture(f) for f in progress(chosen, "gathering samples")),
+        inputs.camera_from_head[chosen],
+        inputs.intrinsics,
+        inputs.moves,
+        kept,
+        allowed=skin,
+        skin=skin,
+        count=settings.sizes.points,
+        progress=lambda items: progress(items, "tracing visibility"),
+    )
+    return fit_appearance(capture, settings.appearance, lambda record: note(_describe(record)))
+
+
+def _describe(record: dict) -> str:
+    return (
+        f"light {record['resolution']}, step {record['step']}: residual {record['fitted']:.5f} fitted, "
+        f"{record['held_out']:.5f} held out; specular {record['specular_intensity']:.3f}, "
+        f"roughness {record['roughness']:.3f}"
+    )
+
+
+def shade_vertices(
+    inputs, appearance: Settings, viewer, scenery: Scenery, solution: Solution, progress
+) -> VertexShading:
+    """Shading of all vertices that some frame faces, in all frames."""
+    index = np.nonzero(face_front(viewer, inputs.camera_from_head, -0.1))[0]
+    points = mesh_points(viewer.mesh, index)
+    transfer = trace_transfer(
+        viewer.scene,
+        points,
+        scenery.nodes,
+        scenery.directions,
+        progress=lambda batches: progress(batches, "tracing the surface"),
+    )
+    state = solution.state
+    return VertexShading(
+        index,
+        len(viewer.mesh.vertices),
+        points,
+        transfer,
+        scenery.node_transfer,
+        Material(state.node_albedo, state.specular, state.roughness),
+        state.light,
+        scenery.directions,
+        inputs.camera_from_head,
+        inputs.moves,
+        bounce=appearance.bounce,
+    )
+
+
+def make_maps(surface: TexelSurface, material: TexelMaterial, roughness: float) -> dict[str, np.ndarray]:
+    """UV-space images with filled gutters; confidence is the share of the prior's variance that the clip removed."""
+    confidence = PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + 1.0 / np.maximum(material.information, 1e-9))
+    size = (surface.size, surface.size)
+    return {
+        "diffuse_albedo": surface.dilated(surface.to_image(material.albedo.astype(np.float32))),
+        "specular_intensity": surface.dilated(surface.to_image(material.specular.astype(np.float32))),
+        "roughness": np.full(size, roughness, np.float32),
+        "normal": np.broadcast_to(np.array([0.5, 0.5, 1.0], np.float32), size + (3,)).copy(),
+        "confidence": surface.to_image(confidence.astype(np.float32)),
+    }
+
+
+def summarise(inputs: InverseInputs, result: InverseResult, frame_index: np.ndarray) -> dict:
+    """What solve.json says, but for the rendered frames. frame_index [F]: the source's numbers of the frames."""
+    solution, state = result.solution, result.solution.state
+    skin = np.median(state.albedo, axis=0)
+    seen = result.material.information > 1.0
+    return {
+        "model": {
+            "light": f"cubemap of 6 x {round((len(state.log_light) / 6) ** 0.5)}^2 texels",
+            "specular_intensity": round(state.specular, 4),
+            "specular_variation": result.record["texture"]["chosen"],
+            "roughness": round(state.roughness, 4),
+            "moves": inputs.moves,
+        },
+        "residuals": {
+            "fitted": solution.fitted,
+            "held_out": solution.held_out,
+            "texture_held_out": result.record["texture"]["held_out"],
+        },
+        "iterations": list(solution.iterations),
+        "albedo_scale": {
+            "method": "priors: luminance and chroma of reference skins, a light that is white on average, and the "
+            "strength of highlights relative to their usual range",
+            "skin_albedo": [round(float(value), 4) for value in skin],
+            "skin_luminance": round(float(skin @ LUMINANCE), 4),
+        },
+        "held_out_frames": [int(frame) for frame in frame_index[~result.fitted]],
+        "seen_share_of_texels": round(float(seen.mean()), 4),
+        "warnings": warnings_about(result),
+    }
+
+
+def warnings_about(result: InverseResult) -> list[str]:
+    """What a person should know before trusting the maps."""
+    found, solution = [], result.solution
+    if solution.held_out > 1.3 * solution.fitted:
+        found.append(
+            f"frames held out fit worse ({solution.held_out:.4f}) than fitted ones ({solution.fitted:.4f}): "
+            "poses or shape may be off, or the light changed"
+        )
+    if solution.held_out > 0.06:
+        found.append(f"the model explains the clip poorly: residual {solution.held_out:.3f} of full scale")
+    return found

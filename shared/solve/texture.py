@@ -1,0 +1,107 @@
+"""Albedo and specular intensity per texel, from all frames, in closed form.
+
+Frames stream through: each adds its share to every texel's normal equations, so memory depends on the map's size
+alone (76 bytes per texel). With the light, the roughness and the geometry given, a texel's radiance is linear in its
+albedo a [3] and its specular intensity s:  I = a E + s S. A second pass over the frames weighs each sample by how well
+the first pass's result explains it (Cauchy), which leaves out hair, blinks and what slid by.
+
+The intensity of a single texel is poorly determined, but it varies slowly over skin: its equations (albedo
+eliminated) are summed over a neighbourhood on the map before they are solved. How wide is chosen on held-out frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from shared.texels import TexelSamples, TexelSurface
+
+CORRELATED_FRAMES = 6.0
+"""Errors of neighbouring frames are alike: so many frames count as one independent observation."""
+
+POOL = 1.0
+"""Texels of a neighbourhood that count as independent for the specular intensity: errors of shape and light are as
+wide as the neighbourhood itself."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviation of a sample: absolute + relative * radiance."""
+
+    absolute: float = 0.006
+    relative: float = 0.03
+
+    def precision(self, colours: np.ndarray) -> np.ndarray:
+        """Inverse variance, the shape of colours."""
+        return 1.0 / np.square(self.absolute + self.relative * colours)
+
+
+@dataclass(frozen=True)
+class TexelMaterial:
+    """albedo [T, 3] and specular [T] of the texels, information [T]: precision of the log albedo by
+    the samples, in the channel that they determine least."""
+
+    albedo: np.ndarray
+    specular: np.ndarray
+    information: np.ndarray
+
+
+class NormalEquations:
+    """Sums over frames per texel and channel of weighted products of E, S and the colour I."""
+
+    def __init__(self, texels: int, noise: Noise):
+        self.noise = noise
+        self.ee, self.es, self.ei, self.ss, self.si = (np.zeros((texels, 3), np.float32) for _ in range(5))
+
+    def add(self, samples: TexelSamples, irradiance: np.ndarray, reflection: np.ndarray, robust: np.ndarray) -> None:
+        """irradiance, reflection, robust [n, 3] at samples.rows; robust: extra weight per channel."""
+        weight = samples.weight[:, None] * self.noise.precision(samples.colours) * robust
+        rows, we, ws = samples.rows, weight * irradiance, weight * reflection
+        self.ee[rows] += we * irradiance
+        self.es[rows] += we * reflection
+        self.ei[rows] += we * samples.colours
+        self.ss[rows] += ws * reflection
+        self.si[rows] += ws * samples.colours
+
+    def solve_albedo(self, specular: np.ndarray, fallback: np.ndarray, pull: float) -> np.ndarray:
+        """Albedo [T, 3] for given specular [T]; fallback [T, 3] acts with precision pull."""
+        moment = self.ei - specular[:, None] * self.es
+        return np.clip((moment + pull * fallback) / (self.ee + pull), 0.002, 1.0).astype(np.float32)
+
+    def specular_equations(self) -> tuple[np.ndarray, np.ndarray]:
+        """Curvature and moment [T] of each texel's intensity with its albedo eliminated, summed over channels."""
+        ratio = self.es / np.maximum(self.ee, 1e-6)
+        return np.maximum((self.ss - ratio * self.es).sum(1), 0.0), (self.si - ratio * self.ei).sum(1)
+
+    def information(self, typical_albedo: np.ndarray) -> np.ndarray:
+        """[T, 3] precision of the log albedo per channel, with correlated frames taken together.
+
+        Where little light arrives a small error makes a large albedo: typical_albedo [3] bounds what counts.
+        """
+        albedo = np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)
+        return self.ee * albedo**2 / CORRELATED_FRAMES
+
+
+def robust_weight(model: np.ndarray, samples: TexelSamples, noise: Noise, scale: float = 2.5) -> np.ndarray:
+    """Cauchy weight [n, 3] of each sample given the model [n, 3]; 0 where a clipped or crushed sample is satisfied."""
+    error = model - samples.colours
+    satisfied = ((samples.limits > 0) & (error >= 0)) | ((samples.limits < 0) & (error <= 0))
+    return np.where(satisfied, 0.0, 1.0 / (1.0 + error**2 * noise.precision(samples.colours) / scale**2))
+
+
+def pooled_specular(
+    surface: TexelSurface, equations: NormalEquations, width: float, mean: float, sigma: float
+) -> np.ndarray:
+    """Intensity [T]: the equations summed over a Gaussian of width texels, with a normal prior.
+
+    Infinite width: one value everywhere, the prior's mean.
+    """
+    if not np.isfinite(width):
+        return np.full(len(surface), mean, np.float32)
+    curvature, moment = equations.specular_equations()
+    spread = [gaussian_filter(surface.to_image(x / CORRELATED_FRAMES), width) for x in (curvature, moment)]
+    curvature, moment = (image.ravel()[surface.pixel] for image in spread)
+    value = (POOL * moment + mean / sigma**2) / (POOL * curvature + 1.0 / sigma**2)
+    return np.clip(value, 0.0, 2.0).astype(np.float32)

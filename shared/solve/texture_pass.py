@@ -1,0 +1,125 @@
+"""Runs the frames through the texture's normal equations: two passes to fit, one over held-out frames to choose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.gather import Picture, SurfaceViewer
+from shared.shading import VertexShading
+from shared.solve.texture import (
+    Noise,
+    NormalEquations,
+    TexelMaterial,
+    pooled_specular,
+    robust_weight,
+)
+from shared.texels import TexelSamples, TexelSurface, harmonic_fill
+
+_ALBEDO_PULL = 10.0
+
+
+@dataclass(frozen=True)
+class Clip:
+    """The frames as the pass reads them: picture(f) for f in range(F), poses [F, 4, 4], intrinsics of the pictures,
+    fitted [F] bool; the others are held out."""
+
+    picture: Callable[[int], Picture]
+    camera_from_head: np.ndarray
+    intrinsics: np.ndarray
+    fitted: np.ndarray
+
+
+class TexturePass:
+    """Per-texel albedo and specular intensity under a fixed light, roughness and geometry.
+
+    specular: the clip's one intensity, the prior's mean; typical_albedo [3]; sigma: how far a texel may leave it.
+    """
+
+    def __init__(
+        self,
+        surface: TexelSurface,
+        viewer: SurfaceViewer,
+        shading: VertexShading,
+        clip: Clip,
+        specular: float,
+        typical_albedo: np.ndarray,
+        sigma: float = 0.25,
+        noise: Noise | None = None,
+        progress: Callable = lambda items, label: items,
+    ):
+        self.surface, self.viewer, self.shading, self.clip = surface, viewer, shading, clip
+        self.typical_albedo = typical_albedo
+        self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), progress
+
+    def run(self, widths: tuple[float, ...]) -> tuple[TexelMaterial, dict]:
+        """Both passes -> the material, and a record of what the held-out frames said to each pooling width."""
+        count = len(self.surface)
+        mean = np.full(count, self.specular, np.float32)
+        equations = self._accumulate(None, "texture, first pass")
+        first = self._close(equations, mean)
+        equations = self._accumulate(first, "texture, second pass")
+        candidates = [
+            self._close(equations, pooled_specular(self.surface, equations, width, self.specular, self.sigma))
+            for width in widths
+        ]
+        errors = self.held_out_errors(candidates)
+        best = int(np.argmin(errors))
+        names = ["one value" if not np.isfinite(width) else f"{width:g} texels" for width in widths]
+        record = {"held_out": dict(zip(names, errors, strict=True)), "chosen": names[best]}
+        return candidates[best], record
+
+    def _accumulate(self, material: TexelMaterial | None, label: str) -> NormalEquations:
+        equations = NormalEquations(len(self.surface), self.noise)
+        for f in self.progress(np.nonzero(self.clip.fitted)[0], label):
+            samples, irradiance, reflection = self.frame(f)
+            if material is None:
+                robust = (samples.limits == 0).astype(np.float32)
+            else:
+                robust = robust_weight(_model(material, samples, irradiance, reflection), samples, self.noise)
+            equations.add(samples, irradiance, reflection, robust)
+        return equations
+
+    def frame(self, f: int) -> tuple[TexelSamples, np.ndarray, np.ndarray]:
+        """Samples of one frame with E and S [n, 3] at them."""
+        clip = self.clip
+        pose, picture = clip.camera_from_head[f], clip.picture(f)
+        view = self.viewer.view(pose, clip.intrinsics, picture.inside.shape[::-1])
+        samples = self.surface.samples(view, picture, pose, clip.intrinsics)
+        both = np.concatenate([self.shading.irradiance(f), self.shading.reflection(f)], axis=1)
+        both = self.surface.interpolate(both, samples.rows)
+        return samples, both[:, :3], both[:, 3:]
+
+    def _close(self, equations: NormalEquations, specular: np.ndarray) -> TexelMaterial:
+        """Albedo for given intensities; channels left open by the samples follow the others and the neighbourhood."""
+        information = equations.information(self.typical_albedo)
+        rough = equations.solve_albedo(specular, np.zeros_like(equations.ee), 1e-6)
+        certain = information / (1.0 + information)
+        known, total = self.surface.to_vertices(rough, certain)
+        smooth = harmonic_fill(self.surface.mesh, known, total > 0.5)
+        smooth = np.maximum(self.surface.interpolate(smooth.astype(np.float32)), 1e-3)
+        # A texel's brightness by its certain channels, its colour otherwise the neighbourhood's.
+        brighter = (certain * np.log(np.maximum(rough, 1e-3) / smooth)).sum(1) / (certain.sum(1) + 0.3)
+        albedo = equations.solve_albedo(specular, smooth * np.exp(brighter)[:, None], _ALBEDO_PULL)
+        return TexelMaterial(albedo, specular, information.min(1))
+
+    def held_out_errors(self, candidates: list[TexelMaterial]) -> list[float]:
+        """Root mean square residual of each candidate on the held-out frames (linear, censored, trust-weighted)."""
+        squared, total = np.zeros(len(candidates)), 0.0
+        for f in self.progress(np.nonzero(~self.clip.fitted)[0], "texture, held-out frames"):
+            samples, irradiance, reflection = self.frame(f)
+            total += 3.0 * float(samples.weight.sum())
+            for k, material in enumerate(candidates):
+                error = _model(material, samples, irradiance, reflection) - samples.colours
+                error[((samples.limits > 0) & (error >= 0)) | ((samples.limits < 0) & (error <= 0))] = 0.0
+                squared[k] += float((samples.weight[:, None] * np.minimum(error**2, 0.01)).sum())
+        return [float(value) for value in np.sqrt(squared / max(total, 1e-9))]
+
+
+def _model(
+    material: TexelMaterial, samples: TexelSamples, irradiance: np.ndarray, reflection: np.ndarray
+) -> np.ndarray:
+    rows = samples.rows
+    return material.albedo[rows] * irradiance + material.specular[rows, None] * reflection

@@ -1,0 +1,103 @@
+"""A texture map as points on the surface: sampling frames at texels, filling what no frame shows, and gutters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse.linalg import spsolve
+
+from shared.gather import Picture, View, sample_colours, sample_inside, sample_limits, texel_size
+from shared.geometry import project
+from shared.mesh import Mesh, interpolate, rasterize_uv, uniform_laplacian
+
+
+@dataclass(frozen=True)
+class TexelSamples:
+    """One frame at the texels rows [n] (indices into TexelSurface): colours [n, 3], weight [n], limits int8 [n, 3]."""
+
+    rows: np.ndarray
+    colours: np.ndarray
+    weight: np.ndarray
+    limits: np.ndarray
+
+
+class TexelSurface:
+    """The T texels of a size x size map that lie on the mesh: face [T], bary [T, 3], position [T, 3] mm."""
+
+    def __init__(self, mesh: Mesh, size: int):
+        self.mesh, self.size = mesh, size
+        face, bary = rasterize_uv(mesh, size)
+        # Faces without area in the layout give no corner weights.
+        self.pixel = np.nonzero((face >= 0).ravel() & np.isfinite(bary).all(-1).ravel())[0]
+        self.face, self.bary = face.ravel()[self.pixel], bary.reshape(-1, 3)[self.pixel]
+        self.position = interpolate(mesh.vertices.astype(np.float32), mesh.faces, self.face, self.bary)
+        self._texel_mm = texel_size(mesh, size).astype(np.float32)
+
+    def __len__(self) -> int:
+        return len(self.pixel)
+
+    def interpolate(self, values: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Vertex values [V, ...] at some texels."""
+        return interpolate(values, self.mesh.faces, self.face[rows], self.bary[rows])
+
+    def to_image(self, values: np.ndarray, elsewhere: float = 0.0) -> np.ndarray:
+        """[T, ...] -> [size, size, ...]."""
+        image = np.full((self.size**2,) + values.shape[1:], elsewhere, values.dtype)
+        image[self.pixel] = values
+        return image.reshape((self.size, self.size) + values.shape[1:])
+
+    def dilated(self, image: np.ndarray) -> np.ndarray:
+        """The gutters around the charts take the nearest texel's value, so that filtering never reads background."""
+        empty = np.ones((self.size, self.size), bool)
+        empty.ravel()[self.pixel] = False
+        if not empty.any():
+            return image
+        rows, columns = distance_transform_edt(empty, return_distances=False, return_indices=True)
+        return image[rows, columns]
+
+    def samples(
+        self, view: View, picture: Picture, camera_from_head: np.ndarray, intrinsics: np.ndarray
+    ) -> TexelSamples:
+        """What one frame shows of the texels; a face counts as seen when all its corners are."""
+        seen_face = (view.weight > 0)[self.mesh.faces].all(1)
+        rows = np.nonzero(seen_face[self.face])[0]
+        pixels, depth = project(self.position[rows], camera_from_head, intrinsics)
+        footprint = self._texel_mm[self.face[rows]] * intrinsics[0, 0] / depth
+        weight = self.interpolate(view.weight, rows) * sample_inside(picture, pixels)
+        colours = sample_colours(picture, pixels, footprint)
+        return TexelSamples(rows, colours, weight.astype(np.float32), sample_limits(picture, pixels))
+
+    def to_vertices(self, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Weighted means of texel values [T, C] around each vertex; weight [T, C] -> means and total weights [V, C]."""
+        count, corners = len(self.mesh.vertices), self.mesh.faces[self.face].ravel()
+        total, mean = np.zeros((count, values.shape[1])), np.zeros((count, values.shape[1]))
+        for c, (value, trust) in enumerate(zip(values.T, weight.T, strict=True)):
+            share = self.bary * trust[:, None]
+            total[:, c] = np.bincount(corners, share.ravel(), count)
+            mean[:, c] = np.bincount(corners, (share * value[:, None]).ravel(), count)
+        return mean / np.maximum(total, 1e-12), total
+
+
+def harmonic_fill(mesh: Mesh, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Vertex values [V, C] with those that are not known [V, C] replaced by their smoothest continuation.
+
+    Solves the graph Laplacian's equation L x = 0 on the unknown vertices with the known ones as boundary; pieces of
+    the mesh without any known vertex take the known median. Works across texture seams, which a fill in the image
+    cannot.
+    """
+    laplacian = uniform_laplacian(mesh.faces, len(mesh.vertices))
+    return np.stack([_fill(laplacian, *pair) for pair in zip(values.T, known.T, strict=True)], axis=1)
+
+
+def _fill(laplacian: sparse.csr_matrix, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    values = np.array(values, np.float64)
+    if known.all() or not known.any():
+        return values
+    unknown, pull = np.nonzero(~known)[0], 1e-4
+    matrix = (laplacian[unknown][:, unknown] + pull * sparse.identity(len(unknown))).tocsc()
+    right = pull * np.median(values[known]) - laplacian[unknown][:, np.nonzero(known)[0]] @ values[known]
+    values[unknown] = spsolve(matrix, right)
+    return values

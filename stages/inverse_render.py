@@ -1,0 +1,169 @@
+"""Inverse rendering: the light, and the skin's albedo, specular intensity and roughness, from the whole clip.
+
+Reads    sample_frames (frames, masks), track_landmarks (poses, mesh, segments).
+Writes   maps/*.exr, envmap.exr, mesh.npz, poses.npz, renders/*.exr, solve.json.
+Method   In head space a surface point's view of the sphere never changes, so visibility and bounces are traced once
+         and reused by all frames. Light by Gauss-Newton with the albedo eliminated, specular intensity in closed form,
+         roughness by line search, stopping on held-out frames; then albedo and specular intensity per texel in closed
+         form, streaming over the frames. The solver starts from a uniform light and the priors: it needs no start
+         from init_albedo, which is an input for comparison only.
+Fails    poses that match no frame; too little of the face seen; results that are not finite.
+"""
+
+from __future__ import annotations
+
+from shared.contract import Job, Output, Parameter, Stage, main
+from shared.errors import LimnError
+
+STAGE = Stage(
+    name="inverse_render",
+    version=1,
+    help="Light, albedo, specular intensity and roughness from the whole clip.",
+    inputs=("sample_frames", "track_landmarks", "init_albedo"),
+    outputs=(
+        Output("maps/*.exr", "albedo, specular intensity, roughness, normal, confidence", space="uv",
+               colour_space="in each file"),
+        Output("envmap.exr", "incident radiance, lat-long", space="world", colour_space="lin_rec709_scene"),
+        Output("mesh.npz", "the head's mesh", unit="mm", space="head"),
+        Output("poses.npz", "camera_from_head [F, 4, 4], frame_index [F], intrinsics of source and crop", unit="mm"),
+        Output("renders/*.exr", "re-renders of chosen crops, 0 outside the head", space="crop",
+               colour_space="lin_rec709_scene"),
+        Output("solve.json", "model, residuals, steps, scale of the albedo, held-out frames, warnings"),
+    ),
+    parameters=(
+        Parameter("map_size", int, 1024, "Edge of the maps; a power of two.", "texels",
+                  choices=(64, 128, 256, 512, 1024, 2048, 4096, 8192)),
+        Parameter("light_resolution", int, 16, "Edge of the light's cubemap faces.", "texels", choices=(4, 8, 16, 32)),
+        Parameter("points", int, 4000, "Surface points that the light is solved from.", "", 200, 40000),
+        Parameter("directions", int, 768, "Directions over the sphere.", "", 128, 8192),
+        Parameter("bounce_nodes", int, 1000, "Surface nodes that exchange bounced light.", "", 50, 6000),
+        Parameter("light_frames", int, 48, "Frames that the light is solved from, spread evenly.", "frames", 3, 1000),
+        Parameter("light_steps", int, 8, "Largest number of steps per resolution of the light.", "", 1, 100),
+        Parameter("hold_out_every", int, 8, "One frame in so many is held out to judge the fit.", "frames", 3, 1000),
+        Parameter("bounce", bool, True, "Count light that bounces between parts of the head."),
+        Parameter("specular", bool, True, "Model specular reflection."),
+        Parameter("roughness", float, 0.45, "Roughness to start from.", "", 0.25, 0.7),
+        Parameter("search_roughness", bool, True, "Search the roughness; else it stays at its start."),
+        Parameter("specular_prior", float, 0.7, "Expected specular intensity of skin.", "", 0.01, 2.0),
+        Parameter("white_light", float, 0.15, "Expected deviation of the light's log colour ratios from grey.", "",
+                  0.01, 2.0),
+        Parameter("light_smoothness", float, 1.0, "Weight of the light's smoothness.", "", 0.0, 1000.0),
+        Parameter("evidence", float, 5000.0, "How many independent samples the clip counts as.", "", 10.0, 1e7),
+        Parameter("render_count", int, 8, "Frames to re-render, spread evenly.", "frames", 1, 2000),
+        Parameter("mesh", str, "", "Mesh (.npz or .obj) to use instead of the tracked one; empty: tracked."),
+        Parameter("poses", str, "", "Poses (.npz: camera_from_head, perhaps frame_index) to use; empty: tracked."),
+    ),
+)
+
+LATLONG_HEIGHT = 128
+FLAT_NORMALS = "flat: this version solves no fine normals"
+
+
+def read_settings(job: Job):
+    """The stage's parameters as the solver's settings."""
+    from shared.solve.appearance import Settings
+    from shared.solve.capture import Sizes
+    from shared.solve.inverse import InverseSettings
+    from shared.solve.light import LightPriors
+
+    params = job.params
+    appearance = Settings(
+        resolutions=tuple(n for n in (8, 16, 32) if n <= params.light_resolution) or (params.light_resolution,),
+        steps=params.light_steps,
+        independent=params.evidence,
+        priors=LightPriors(smooth=params.light_smoothness),
+        white_sigma=params.white_light,
+        bounce=params.bounce,
+        specular=params.specular,
+        roughness=params.roughness,
+        search_roughness=params.search_roughness,
+        specular_prior=(params.specular_prior, 0.5 * params.specular_prior),
+    )
+    return InverseSettings(
+        sizes=Sizes(params.points, params.directions, params.bounce_nodes),
+        appearance=appearance,
+        light_frames=params.light_frames,
+        map_size=params.map_size,
+        hold_out_every=params.hold_out_every,
+    )
+
+
+def write_maps(job: Job, result) -> None:
+    """maps/*.exr and envmap.exr."""
+    from shared.envmap import latlong_from_cube
+    from shared.io.images import write_exr
+
+    (job.out / "maps").mkdir()
+    for name, image in result.maps.items():
+        colour_space = "lin_rec709_scene" if name == "diffuse_albedo" else "data"
+        attributes = {"content": FLAT_NORMALS} if name == "normal" else {}
+        write_exr(job.out / "maps" / f"{name}.exr", image, colour_space=colour_space, attributes=attributes)
+    latlong = latlong_from_cube(result.solution.state.light, LATLONG_HEIGHT)
+    write_exr(job.out / "envmap.exr", latlong, colour_space="lin_rec709_scene", latlong=True)
+
+
+def write_renders(job: Job, inputs, result, frame_index) -> list[int]:
+    """renders/%06d.exr of evenly spread frames -> their indices in the source."""
+    from shared.io.images import write_exr
+    from shared.render import SurfaceMaps, render_frame
+    from shared.solve.capture import spread_frames
+
+    (job.out / "renders").mkdir()
+    maps = SurfaceMaps(result.maps["diffuse_albedo"], result.maps["specular_intensity"])
+    chosen = spread_frames(len(frame_index), job.params.render_count)
+    for f in job.progress(chosen, "re-rendering"):
+        pose = inputs.camera_from_head[f]
+        image, _ = render_frame(result.viewer, result.shading, maps, f, pose, inputs.intrinsics, inputs.size)
+        write_exr(job.out / "renders" / f"{frame_index[f]:06d}.exr", image, colour_space="lin_rec709_scene")
+    return [int(frame_index[f]) for f in chosen]
+
+
+def run(job: Job) -> None:
+    """Solve the light, then the texels; write and re-render."""
+    from shared.io.arrays import save_arrays, write_json
+    from shared.io.clip_inputs import read_inputs
+    from shared.io.meshes import save_mesh
+    from shared.solve.inverse import solve_clip, summarise
+
+    folders = job.input("sample_frames"), job.input("track_landmarks")
+    inputs, frames, frame_index = read_inputs(*folders, job.params.mesh, job.params.poses)
+    result = solve_clip(inputs, read_settings(job), job.progress, job.note)
+    record = summarise(inputs, result, frame_index)
+    for text in record["warnings"]:
+        job.warn(text)
+    write_maps(job, result)
+    extra = {} if inputs.face_segment is None else {"face_segment": inputs.face_segment}
+    save_mesh(job.out / "mesh.npz", inputs.mesh, **extra)
+    save_arrays(
+        job.out / "poses.npz",
+        camera_from_head=inputs.camera_from_head,
+        frame_index=frame_index,
+        intrinsics=frames.intrinsics_source,
+        intrinsics_crop=frames.intrinsics,
+    )
+    record["render_frames"] = write_renders(job, inputs, result, frame_index)
+    write_json(job.out / "solve.json", record)
+
+
+def check(job: Job) -> None:
+    """Maps in range, light positive, part of the map determined, re-renders that are not black."""
+    from shared.io.arrays import read_json
+    from shared.io.images import read_exr
+
+    maps = {path.stem: read_exr(path) for path in sorted((job.out / "maps").glob("*.exr"))}
+    for name, image in maps.items():
+        highest = 2.0 if name == "specular_intensity" else 1.0
+        if not (image.min() >= 0.0 and image.max() <= highest):
+            raise LimnError(f"{name} leaves [0, {highest:g}]: {image.min():.3f} .. {image.max():.3f}")
+    if not (maps["confidence"] > 0.5).mean() > 0.01:
+        raise LimnError("less than a hundredth of the map is determined by the clip")
+    light = read_exr(job.out / "envmap.exr")
+    if light.min() < 0.0 or light.max() <= 0.0:
+        raise LimnError("the light is not positive")
+    for frame in read_json(job.out / "solve.json")["render_frames"]:
+        if read_exr(job.out / "renders" / f"{frame:06d}.exr").max() <= 0.0:
+            raise LimnError(f"the re-render of frame {frame} is black")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(STAGE, run, check))

@@ -1,0 +1,348 @@
+"""The appearance fit on an egg with a nose whose light, albedo and highlights are known, and its parts one by one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from toy_head import toy_head
+
+from shared.brdf import hemispherical_albedo
+from shared.envmap import cube_directions
+from shared.gather import Samples
+from shared.geometry import camera_centres, fibonacci_sphere, rigid, rotation_from_vector, world_from_head
+from shared.lobes import LobeTable, specular_reflection
+from shared.mesh import normalised
+from shared.raycast import RayScene
+from shared.shading import light_along
+from shared.solve.appearance import AppearanceSolver, Capture, Settings
+from shared.solve.fit_appearance import SHAPING_STEPS, fit_appearance, search_roughness
+from shared.solve.light_step import LightStep
+from shared.transfer import bounce_nodes, irradiance, mesh_points, nearest_points, node_radiosity, trace_transfer
+
+FRAMES, ROUGHNESS, SPECULAR, NOISE = 14, 0.4, 0.7, 0.002
+DIRECTIONS = fibonacci_sphere(256)
+
+
+def true_light(directions):
+    """A soft warm lamp at the upper left on a grey sky, white on average over the face."""
+    lamp = np.exp(6.0 * (directions @ normalised(np.array([-0.6, 0.5, 0.7])) - 1.0))
+    sky = 0.45 + 0.15 * directions[:, 1]
+    return np.stack([sky + 2.2 * lamp, sky + 2.0 * lamp, 1.1 * sky + 1.8 * lamp], axis=1)
+
+
+def true_albedo(positions):
+    """Skin of middle tone with patches some centimetres wide."""
+    x, y, z = positions.T / 30.0
+    pattern = 0.25 * np.sin(2.1 * x + y) + 0.2 * np.cos(1.7 * y - z)
+    return np.array([0.50, 0.31, 0.23]) * np.exp(pattern)[:, None]
+
+
+def swinging(frames=FRAMES):
+    """A head that turns 35 degrees to both sides and nods."""
+    angle = np.linspace(0, 2 * np.pi, frames)
+    vectors = np.stack([0.25 * np.sin(2 * angle), 0.6 * np.sin(angle), 0 * angle], axis=1)
+    return rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors), np.tile([0, 0, 900.0], (frames, 1)))
+
+
+def make_truth(specular=SPECULAR, clip_at=np.inf):
+    """Capture, true albedo [P, 3] and true irradiance [P, F, 3], put together from the forward modules."""
+    mesh = toy_head(4).mesh(np.zeros(2), np.zeros(1))
+    scene, nodes, poses = RayScene(mesh.vertices, mesh.faces), bounce_nodes(mesh, 80), swinging()
+    front = np.nonzero(mesh.vertices[:, 2] > 15.0)[0]
+    points = mesh_points(mesh, front)
+    transfer, node_transfer = (trace_transfer(scene, some, nodes, DIRECTIONS) for some in (points, nodes.points))
+    turns = world_from_head(poses, "head")
+    along = light_along(true_light(cube_directions(16)), DIRECTIONS, turns)
+    node_albedo = true_albedo(nodes.points.positions) + specular * hemispherical_albedo(ROUGHNESS)
+    matrices, direct = node_radiosity(node_transfer, node_albedo), node_transfer.direct.astype(np.float64)
+    radiosity = np.stack([matrices[..., c] @ direct @ along[..., c] for c in range(3)], axis=-1)
+    flat = along.reshape(len(DIRECTIONS), -1), radiosity.reshape(len(direct), -1)
+    light = irradiance(transfer, *flat).reshape(len(points), FRAMES, 3)
+    towards = normalised(camera_centres(poses)[None] - points.positions[:, None])
+    table = LobeTable(points.normals, transfer.visibility(), DIRECTIONS)
+    lobes = [specular_reflection(table, towards[:, f], ROUGHNESS, along[:, f]) for f in range(FRAMES)]
+    albedo = true_albedo(points.positions)
+    colours = albedo[:, None] * light + specular * np.stack(lobes, axis=1)
+    colours += NOISE * np.random.default_rng(0).normal(size=colours.shape)
+    cosine = (towards * points.normals[:, None]).sum(2)
+    weight = np.where(cosine > 0.2, cosine**2, 0.0).astype(np.float32)
+    limits = (colours > clip_at).astype(np.int8)
+    samples = Samples(np.clip(colours, 0, clip_at).astype(np.float32), weight, limits, towards.astype(np.float32))
+    fitted, skin = np.arange(FRAMES) % 5 != 2, np.ones(len(points), bool)
+    capture = Capture(points, samples, transfer, nodes, node_transfer, DIRECTIONS, turns, fitted, skin)
+    seen = (weight[:, fitted] > 0).sum(1) >= 4
+    index = np.nonzero(seen)[0]
+    parts = {"points": points.take(index), "samples": samples.points(index), "transfer": transfer.take(index)}
+    return replace(capture, **parts, skin=skin[index]), albedo[index], light[index]
+
+
+@pytest.fixture(scope="module")
+def one_thread():
+    """Matrices this small are slower on several threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def truth(one_thread):
+    return make_truth()
+
+
+@pytest.fixture(scope="module")
+def matte(one_thread):
+    return make_truth(specular=0.0)
+
+
+MATTE = Settings(resolutions=(6,), steps=4, specular=False, noise=(0.003, 0.01))
+
+
+def solver_of(capture, settings=MATTE):
+    """A solver one step into the fit."""
+    solver = AppearanceSolver(capture, settings)
+    solver.bake()
+    if settings.specular:
+        solver.bake_lobes()
+    return solver
+
+
+def scale_free_error(found, true):
+    """Relative error [N, 3] after the best factor per channel."""
+    ratio = found / true
+    return ratio / np.median(ratio, axis=0) - 1.0
+
+
+def truly_lit(solver, capture):
+    """What the solver's forward model gives under the true light and the true node albedo."""
+    solver.set_resolution(16)
+    solver.state.node_albedo = true_albedo(capture.nodes.points.positions)
+    solver.bake()
+    return solver.forward(true_light(cube_directions(16)))
+
+
+# ---------------------------------------------------------------------- the fit as a whole
+
+
+@pytest.fixture(scope="module")
+def solution(truth):
+    capture, _, _ = truth
+    settings = Settings(resolutions=(8,), steps=7, noise=(0.003, 0.01), roughness=0.45)
+    return fit_appearance(capture, settings)
+
+
+def test_albedo_is_recovered_up_to_scale(truth, solution):
+    _, albedo, _ = truth
+    error = np.abs(scale_free_error(solution.state.albedo, albedo))
+    assert np.median(error) < 0.03
+    assert np.quantile(error, 0.95) < 0.12
+    # The priors know skin and white light: the factor itself is right to the width of theirs.
+    factor = np.median(solution.state.albedo / albedo, axis=0)
+    assert np.abs(np.log(factor)).max() < 0.5
+    assert np.ptp(np.log(factor)) < 0.2
+
+
+def test_light_is_recovered_at_low_frequency(truth, solution):
+    """Irradiance of an unoccluded ball under the found and the true light, over directions that lit the face."""
+    light = solution.state.light
+    resolution = round((len(light) / 6) ** 0.5)
+    normals = fibonacci_sphere(200)
+    normals = normals[normals[:, 2] > 0.0]
+    cosine = np.maximum(normals @ DIRECTIONS.T, 0.0)
+    found = cosine @ light_along(light, DIRECTIONS, np.eye(3)[None])[:, 0]
+    true = cosine @ true_light(DIRECTIONS)
+    assert light_along(light, DIRECTIONS, np.eye(3)[None]).min() > 0 and resolution == 8
+    assert np.sqrt((scale_free_error(found, true) ** 2).mean()) < 0.1
+    brightest = normalised((light * np.ones((1, 3))).sum(1) @ cube_directions(resolution))
+    expected = normalised(true_light(DIRECTIONS).sum(1) @ DIRECTIONS)
+    assert brightest @ expected > np.cos(np.radians(20))
+
+
+def test_residuals_come_down_to_the_noise(solution):
+    assert solution.fitted < 3.0 * NOISE
+    assert solution.held_out < 4.0 * NOISE
+    assert 0.2 < solution.state.specular < 1.6
+    assert 0.25 <= solution.state.roughness <= 0.7
+
+
+def test_the_best_held_out_state_wins(solution):
+    candidates = [record["held_out"] for record in solution.iterations[SHAPING_STEPS:]]
+    assert solution.held_out == min(candidates)
+    assert solution.iterations[0]["held_out"] > 2.0 * solution.held_out
+
+
+def test_the_fit_stops_where_held_out_frames_stop_improving(matte):
+    """Held-out frames that show nothing but noise cannot improve: two steps after the shaping ones, then the end."""
+    capture, _, _ = matte
+    colours = capture.samples.colours.copy()
+    noise = np.random.default_rng(1).uniform(0, 1, colours.shape)
+    colours[:, ~capture.fitted] = noise[:, ~capture.fitted]
+    spoiled = replace(capture, samples=replace(capture.samples, colours=colours))
+    found = fit_appearance(spoiled, replace(MATTE, steps=12, resolutions=(4,)))
+    assert len(found.iterations) < 10
+    assert found.held_out > 0.1 > found.fitted
+
+
+def test_the_fit_is_deterministic(matte):
+    capture, _, _ = matte
+    settings = replace(MATTE, resolutions=(4,), steps=2)
+    first, second = (fit_appearance(capture, settings).state for _ in range(2))
+    assert np.array_equal(first.log_light, second.log_light)
+    assert np.array_equal(first.albedo, second.albedo)
+
+
+# ---------------------------------------------------------------------- its parts
+
+
+def test_forward_model_is_the_composition_of_its_modules(truth):
+    capture, _, light = truth
+    solver = AppearanceSolver(capture, GLOSSY)
+    solver.state.specular = SPECULAR
+    solver.bake_lobes()
+    found, reflection = truly_lit(solver, capture)
+    assert np.allclose(np.moveaxis(found.numpy(), 0, -1), light, rtol=0.01)
+    table = LobeTable(capture.points.normals, capture.transfer.visibility(), DIRECTIONS)
+    along = light_along(true_light(cube_directions(16)), DIRECTIONS, capture.world_from_head)
+    expected = specular_reflection(table, capture.samples.towards_camera[:, 3], ROUGHNESS, along[:, 3])
+    open_points = capture.transfer.blocked < 1e-3
+    assert np.allclose(reflection[:, :, 3].numpy().T[open_points], expected[open_points], rtol=0.02, atol=1e-3)
+
+
+def test_elimination_is_weighted_least_squares(matte):
+    """Albedo under the true light by brute force, and the truth itself to the noise."""
+    capture, albedo, _ = matte
+    solver = AppearanceSolver(capture, MATTE)
+    light, reflection = truly_lit(solver, capture)
+    weight = solver.weights(None)
+    found = solver.eliminate(light, reflection, weight)[..., 0].numpy().T
+    assert np.abs(found / albedo - 1.0).max() < 0.03
+    frames = capture.fitted
+    for p in range(0, len(albedo), 40):
+        for c in range(3):
+            root = np.sqrt(weight[c, p, frames].numpy().astype(np.float64))
+            design, right = light[c, p, frames].numpy() * root, capture.samples.colours[p, frames, c] * root
+            expected = np.linalg.lstsq(design[:, None], right, rcond=None)[0][0]
+            assert found[p, c] == pytest.approx(expected, rel=2e-3)
+
+
+def test_highlights_are_joint_least_squares(truth):
+    """The specular intensity with albedo eliminated is what one big least-squares problem gives."""
+    capture, _, _ = truth
+    some = np.arange(0, len(capture.points), 9)
+    capture = replace(
+        capture,
+        points=capture.points.take(some),
+        samples=capture.samples.points(some),
+        transfer=capture.transfer.take(some),
+        skin=capture.skin[some],
+    )
+    solver = AppearanceSolver(capture, GLOSSY)
+    solver.bake_lobes()
+    light, reflection = truly_lit(solver, capture)
+    weight = solver.weights(None) * solver.fitted
+    found = solver.highlights(light, reflection, weight).intensity
+    points = len(some)
+    for c in range(3):
+        rows, columns = np.nonzero(weight[c].numpy() > 0)
+        design = np.zeros((len(rows), points + 1))
+        design[np.arange(len(rows)), rows] = light[c].numpy()[rows, columns]
+        design[:, -1] = reflection[c].numpy()[rows, columns]
+        root = np.sqrt(weight[c].numpy()[rows, columns])
+        right = capture.samples.colours[rows, columns, c] * root
+        expected = np.linalg.lstsq(design * root[:, None], right, rcond=None)[0][-1]
+        assert found[c] == pytest.approx(expected, rel=0.01)
+    assert np.allclose(found, SPECULAR, rtol=0.1)
+
+
+def test_clipped_samples_do_not_bias(one_thread):
+    """Many red samples end at the clipping level; the light being known, albedo must not suffer."""
+    capture, albedo, _ = make_truth(specular=0.0, clip_at=0.45)
+    clipped = (capture.samples.limits[..., 0] > 0) & (capture.samples.weight > 0)
+    solver = AppearanceSolver(capture, MATTE)
+    light, reflection = truly_lit(solver, capture)
+    used = (capture.samples.weight > 0) & capture.fitted
+    share = (clipped & used).sum(1) / used.sum(1)
+    partly = (share > 0.3) & ((used & ~clipped).sum(1) >= 2)
+    assert partly.sum() > 20
+
+    def error(weight):
+        found = solver.eliminate(light, reflection, weight)[0, :, 0].numpy()
+        return float(np.median(found[partly] / albedo[partly, 0])) - 1.0
+
+    solver.state.albedo = albedo
+    assert abs(error(solver.weights(solver.model(light, reflection)))) < 0.005
+    assert error(solver.trust * solver.precision) < -0.03
+    above = light * 0 + 2.0
+    assert float(solver.weights(above)[0].numpy()[clipped].max()) == 0.0
+    assert float(solver.weights(above * 0)[0].numpy()[clipped].min()) > 0.0
+
+
+GLOSSY = replace(MATTE, specular=True, roughness=ROUGHNESS)
+
+
+@pytest.mark.parametrize("settings", [MATTE, replace(MATTE, bounce=False), GLOSSY], ids=["matte", "direct", "glossy"])
+def test_gradient_is_the_derivative_of_the_cost(truth, settings):
+    """Along random directions under a light of too little contrast; what is eliminated is fitted anew at both ends."""
+    solver = solver_of(truth[0], settings)
+    solver.trust_highlights = settings.specular
+    rng = np.random.default_rng(0)
+    solver.state.log_light = 0.6 * np.log(true_light(cube_directions(6)))
+    step = LightStep(solver)
+    for _ in range(6 if settings.specular else 0):
+        solver.state.specular = solver.highlights(step.irradiance, step.reflection, step.weight).pooled
+        step = LightStep(solver)
+    gradient, slopes, expected = step.gradient(), [], []
+    for _ in range(6):
+        change = rng.normal(size=gradient.shape)
+        change *= 0.05 / np.linalg.norm(change)
+        ahead, behind = (step.cost(solver.state.log_light + sign * change) for sign in (1, -1))
+        slopes.append((ahead - behind) / 2.0)
+        expected.append((gradient * change).sum())
+    assert np.allclose(slopes, expected, atol=(0.05 if settings.specular else 0.01) * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("settings", [MATTE, GLOSSY], ids=["matte", "glossy"])
+def test_gauss_newton_product_is_symmetric_and_positive(truth, settings):
+    solver = solver_of(truth[0], settings)
+    solver.trust_highlights = settings.specular
+    step = LightStep(solver)
+    step.gradient()
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(size=(2, 6 * 6**2, 3))
+    size = (a * step.product(a)).sum()
+    assert size > 0
+    assert (a * step.product(b)).sum() == pytest.approx((b * step.product(a)).sum(), abs=3e-3 * size)
+    # What only scales the light is absorbed by the albedo.
+    scale = np.ones((6 * 6**2, 3))
+    assert abs((scale * step.product(scale)).sum()) < 3e-3 * size
+
+
+def test_steps_lower_the_cost_and_keep_the_mean_irradiance(matte):
+    capture, _, _ = matte
+    solver = solver_of(capture)
+    step = LightStep(solver)
+    _, before, gauge = solver.mean_on_skin(step.albedo, step.irradiance)
+    assert np.allclose((solver.state.light * gauge).sum(0), 1.0, rtol=1e-3)
+    step.take()
+    assert step.cost(solver.state.log_light) < 0.5 * step.before
+    _, after, _ = solver.mean_on_skin(step.albedo, solver.forward(solver.state.light)[0])
+    assert np.abs(after - before).max() < 0.5
+
+
+def test_roughness_search_moves_towards_the_truth(truth):
+    capture, _, _ = truth
+    for start in (0.33, 0.5):
+        solver = AppearanceSolver(capture, replace(MATTE, specular=True, resolutions=(16,), roughness=start))
+        truly_lit_light = np.log(true_light(cube_directions(16)))
+        solver.state.log_light, solver.state.specular = truly_lit_light, SPECULAR
+        solver.state.node_albedo = true_albedo(capture.nodes.points.positions)
+        solver.bake()
+        found = search_roughness(solver)
+        assert abs(np.log(found / ROUGHNESS)) < 0.6 * abs(np.log(start / ROUGHNESS))
+
+
+def test_nodes_take_the_albedo_of_points_beside_them(truth):
+    capture, _, _ = truth
+    solver = AppearanceSolver(capture, MATTE)
+    assert np.array_equal(solver.node_to_point, nearest_points(capture.nodes.points, capture.points))

@@ -1,0 +1,123 @@
+"""The light's operators and priors, the scale between light and albedo, the linear solver and the choice of frames."""
+
+import numpy as np
+import pytest
+
+from shared.color import LUMINANCE
+from shared.envmap import cube_directions
+from shared.geometry import fibonacci_sphere, rotation_from_vector
+from shared.solve.capture import hold_out, spread_frames
+from shared.solve.light import FrameLight, LightPriors, resample_light
+from shared.solve.light_step import conjugate_gradients
+from shared.solve.scale import (
+    REFERENCE_SKINS,
+    Highlights,
+    fit_skin_locus,
+    most_likely_irradiance,
+    settle_scale,
+)
+
+DIRECTIONS = fibonacci_sphere(256)
+
+
+def smooth_light(directions):
+    """[N, 3] -> [N, 3] radiance of a broad lamp on a grey sky."""
+    lamp = np.exp(4.0 * (directions @ np.array([-0.6, 0.48, 0.64]) - 1.0))
+    return 0.45 + 0.15 * directions[:, 1:2] + lamp[:, None] * [2.2, 2.0, 1.8]
+
+
+def test_frame_light_and_its_adjoint():
+    turns = rotation_from_vector(np.array([[0.0, 0, 0], [0.2, -0.7, 0.1]]))
+    light = FrameLight(6, DIRECTIONS, turns)
+    rng = np.random.default_rng(3)
+    texels, values = rng.normal(size=(216, 3)), rng.normal(size=(len(DIRECTIONS), 2, 3))
+    assert np.allclose(light.along(np.ones((216, 1))), 1.0, atol=1e-6)
+    expected = (light.along(texels) * values).sum()
+    assert (texels * light.adjoint(values)).sum() == pytest.approx(expected, rel=1e-4, abs=1e-3)
+
+
+def test_light_prior_gradient_and_null_space():
+    light, priors = FrameLight(4, DIRECTIONS[:8], np.eye(3)[None]), LightPriors(smooth=2.0, white=3.0, edge=0.4)
+    rng = np.random.default_rng(4)
+    log_light, change = rng.normal(size=(2, 96, 3))
+    _, gradient, product = light.prior(log_light, priors)
+    ahead, behind = (light.prior(log_light + sign * 1e-5 * change, priors)[0] for sign in (1, -1))
+    assert (ahead - behind) / 2e-5 == pytest.approx((gradient * change).sum(), rel=1e-6)
+    assert (change * product(change)).sum() > 0
+    cost, gradient, _ = light.prior(np.full((96, 3), 1.7), priors)
+    assert cost == pytest.approx(0.0, abs=1e-12) and np.allclose(gradient, 0.0)
+
+
+def test_resampled_light_keeps_its_shape():
+    smooth = np.log(smooth_light(cube_directions(12)))
+    assert np.abs(resample_light(smooth, 16) - np.log(smooth_light(cube_directions(16)))).max() < 0.1
+    assert np.allclose(resample_light(smooth, 12), smooth)
+
+
+# ---------------------------------------------------------------------- scale
+
+
+def on_the_locus():
+    """log albedo [3] of the skin that the priors like best: mean luminance (linearised as there), chroma to match."""
+    locus = fit_skin_locus()
+    typical = np.median(REFERENCE_SKINS, axis=0)
+    share = LUMINANCE * typical / (LUMINANCE @ typical)
+    constant = np.log(LUMINANCE @ typical) - share @ np.log(typical)
+    matrix = np.array([share, [1.0, -1, 0], [0, -1.0, 1]])
+    return np.linalg.solve(matrix, [locus.mean_log_luminance - constant, *locus.offset])
+
+
+def test_white_light_on_likely_skin_is_taken_as_such():
+    for level in (-1.0, 0.0, 1.5):
+        found = most_likely_irradiance(on_the_locus() + level)
+        assert np.allclose(found, level, atol=1e-9)
+
+
+def test_the_scale_follows_the_exposure_and_shares_a_tint():
+    radiance = np.log([0.4, 0.3, 0.25])
+    assert np.allclose(most_likely_irradiance(radiance + 0.7), most_likely_irradiance(radiance) + 0.7)
+    tint = np.array([0.1, 0.0, -0.1])
+    moved = most_likely_irradiance(radiance + tint) - most_likely_irradiance(radiance)
+    assert 0.0 < moved[0] - moved[2] < 0.2
+    sure = most_likely_irradiance(radiance + tint, white_sigma=1e-4)
+    assert np.ptp(sure) < 1e-3
+
+
+def test_highlights_tell_a_bright_light_from_bright_skin():
+    """All statements agree on the factor 1/2: light twice too bright, so highlights look half as strong."""
+    skin, mean = on_the_locus(), (0.7, 0.35)
+    light = np.full(3, np.log(2.0))
+    found = Highlights(np.full(3, 0.35), np.full(3, 100.0), np.ones(3))
+    log_factor, specular = settle_scale(skin - light, light, found, mean)
+    assert np.allclose(log_factor, -np.log(2.0), atol=1e-6)
+    assert specular == pytest.approx(0.7, rel=1e-6)
+    without, specular = settle_scale(skin - light, light, None, mean)
+    assert np.allclose(without, -np.log(2.0), atol=1e-6) and specular == 0.7
+    stronger = Highlights(np.full(3, 0.7), np.full(3, 100.0), np.ones(3))
+    assert (settle_scale(skin - light, light, stronger, mean)[0] > -np.log(2.0) + 0.05).all()
+
+
+def test_skin_locus_runs_through_the_reference_skins():
+    locus = fit_skin_locus()
+    luminance = np.log(REFERENCE_SKINS @ LUMINANCE) - locus.mean_log_luminance
+    chroma = np.log(REFERENCE_SKINS[:, [0, 2]] / REFERENCE_SKINS[:, [1]])
+    residual = chroma - locus.offset - luminance[:, None] * locus.slope
+    assert np.allclose(residual.sum(0), 0.0, atol=1e-9) and np.allclose(luminance @ residual, 0.0, atol=1e-9)
+    assert (np.abs(residual) < 3.0 * locus.sigma).all()
+
+
+def test_conjugate_gradients_solve():
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(12, 12))
+    matrix = root @ root.T + np.eye(12)
+    right = rng.normal(size=12)
+    found = conjugate_gradients(lambda x: matrix @ x, right, 60, tolerance=1e-10)
+    assert np.allclose(found, np.linalg.solve(matrix, right), atol=1e-6)
+
+
+def test_frames_are_spread_and_held_out_evenly():
+    assert spread_frames(100, 5).tolist() == [0, 25, 50, 74, 99]
+    assert spread_frames(3, 10).tolist() == [0, 1, 2]
+    fitted = hold_out(40, 8)
+    assert np.nonzero(~fitted)[0].tolist() == [4, 12, 20, 28, 36]
+    assert hold_out(8, 8).all()
