@@ -4,7 +4,7 @@ Landmark networks slide over the skin as the head turns. Here every frame is war
 by a surface that is roughly right (first the landmarks' triangulation, then the fitted head), so that what remains is a
 small motion, found by dense inverse search flow on images of log local contrast: those show skin, not light.
 
-References: Kroeger et al., Fast optical flow using dense inverse search, ECCV 2016; forward-backward check: Kalal et al.,
+References: Kroeger et al., Fast optical flow using dense inverse search, ECCV 2016; Kalal et al. (the check),
 Forward-backward error, ICPR 2010.
 """
 
@@ -164,7 +164,7 @@ class _Places:
 
 
 def _track_frame(grid, target, contrast, unusable, layout, shown, place: _Places) -> np.ndarray:
-    """Positions [N, 2] of the grid's points in one frame, NaN where not found; layout [h, w, 2] is where they should be."""
+    """Positions [N, 2] of the grid's points in one frame, NaN: not found; layout [h, w, 2] is where they should be."""
     rows, columns = place.rows, place.columns
     found = np.full((len(rows), 2), np.nan)
     if shown[rows, columns].sum() < LEAST_SHOWN:

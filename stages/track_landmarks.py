@@ -98,7 +98,8 @@ def judge_frames(job: Job, frames, used: np.ndarray, presence: np.ndarray, track
         elif not track.reliable[place[0]]:
             reason = "too little skin could be tracked"
         elif not fits[place[0]]:
-            reason = f"track error {np.nanmedian(track.error_px[place[0]]):.2f} px: blur, talk or a hand before the face"
+            error_px = np.nanmedian(track.error_px[place[0]])
+            reason = f"track error {error_px:.2f} px: blur, talk or a hand before the face"
         if reason:
             excluded.append({"frame_index": int(frames.frame_index[i]), "reason": reason})
     return fits, excluded

@@ -94,6 +94,7 @@ def main() -> int:
                 old = read_json(target)
                 if old["content"] != summary["content"] and old["version"] == summary["version"]:
                     print(f"{stage}: the result changed but the stage's version is still {old['version']}: raise it")
+            GOLDEN_FOLDER.mkdir(parents=True, exist_ok=True)
             write_json(target, summary)
             print(f"{target}: {len(summary['content'])} files")
     return 0

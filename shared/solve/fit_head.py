@@ -73,7 +73,7 @@ class FitWeights:
 
 
     def for_depth_noise(self, noise_mm: float) -> FitWeights:
-        """Weights for track points whose depth is uncertain by noise_mm: the model counts more, the surface is stiffer."""
+        """For track points whose depth is uncertain by noise_mm: the model counts more, the surface is stiffer."""
         track_mm = float(np.hypot(self.track_mm, noise_mm))
         return replace(self, track_mm=track_mm, stiffness=self.stiffness * (1.0 + (noise_mm / 0.5) ** 2))
 
@@ -176,7 +176,8 @@ def _landmark_basis(model: HeadModel, basis: np.ndarray, known: np.ndarray) -> n
 
 def _fit_vertices(model: HeadModel) -> np.ndarray:
     """Indices of vertices that tracks may pull: skin, not eyeballs, inner mouth or scalp."""
-    unpulled = [i for i, name in enumerate(model.segment_names) if name in ("eyes", "eye_sockets", "inner_mouth", "scalp")]
+    held = ("eyes", "eye_sockets", "inner_mouth", "scalp")
+    unpulled = [i for i, name in enumerate(model.segment_names) if name in held]
     faces = model.faces[~np.isin(model.face_segment, unpulled)]
     return np.unique(faces)
 
@@ -190,7 +191,9 @@ def _closest(vertices, normals, usable, points, reach_mm):
     return near, offset, (distance < reach_mm) / (1.0 + (offset / spread) ** 2)
 
 
-def fit_surface(model: HeadModel, fit: HeadFit, points: np.ndarray, weights: FitWeights, iterations: int = 5) -> HeadFit:
+def fit_surface(
+    model: HeadModel, fit: HeadFit, points: np.ndarray, weights: FitWeights, iterations: int = 5
+) -> HeadFit:
     """The free correction: vertices move by a thin plate through the track points [N, 3] (track space)."""
     count = len(fit.vertices)
     laplacian = uniform_laplacian(model.faces, count)
@@ -230,7 +233,7 @@ def landmarks_on_points(
 
 
 def triangulate(points_px: np.ndarray, camera_from_points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Least-squares points [N, 3] from pixels [F, N, 2] and poses [F, 4, 4] (linear method, Hartley and Zisserman 12.2)."""
+    """Least-squares points [N, 3] from pixels [F, N, 2] and poses [F, 4, 4] (Hartley and Zisserman, 12.2)."""
     x = (points_px - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]]
     pose = camera_from_points[:, None, :3]
     rows = pose[:, :, :2] - x[..., None] * pose[:, :, 2:]

@@ -40,6 +40,8 @@ REFERENCE_SKINS = np.array(
 LUMINANCE_SIGMA = 0.45
 WHITE_SIGMA = 0.15
 HIGHLIGHT_SIGMA = 0.08
+MODEL_ERROR = 0.003
+"""Share of the diffuse radiance that passes for highlights where shape or visibility are a little off."""
 
 
 @dataclass(frozen=True)
@@ -125,16 +127,27 @@ def settle_scale(
     """
     matrix, right = scale_prior(log_albedo + log_irradiance, white_sigma)
     mean, sigma = specular_prior
+    alone = np.linalg.lstsq(matrix, right - matrix @ log_irradiance, rcond=None)[0]
     if highlights is None:
-        return np.linalg.lstsq(matrix, right - matrix @ log_irradiance, rcond=None)[0], mean
+        return alone, mean
     best = np.clip(highlights.intensity, 0.05, 2.0)
-    spread = HIGHLIGHT_SIGMA * highlights.diffuse_share / highlights.diffuse_share.mean()
+    spread = _highlight_spread(highlights, mean)
 
     def residuals(x: np.ndarray) -> np.ndarray:
         amplitude = (x[3] + x[:3] - np.log(best)) / spread
+        amplitude = np.sign(amplitude) * np.sqrt(np.log1p(amplitude**2))
         return np.concatenate([matrix @ (log_irradiance + x[:3]) - right, amplitude, [(x[3] - np.log(mean)) / sigma]])
 
-    log_factor = least_squares(residuals, np.array([0.0, 0.0, 0.0, np.log(mean)]), method="lm").x[:3]
+    log_factor = least_squares(residuals, np.append(alone, np.log(mean)), method="lm").x[:3]
     factor, precision = np.exp(log_factor), highlights.precision
     specular = (precision * factor * best).sum() / max((precision * factor**2).sum(), 1e-12)
     return log_factor, float(np.clip(specular, 0.0, 2.0))
+
+
+def _highlight_spread(highlights: Highlights, mean_intensity: float) -> np.ndarray:
+    """Standard deviation [3] of the log intensities: the diffuse model's errors and, where highlights are faint or few,
+    what the samples leave open. Beyond it the loss is Cauchy's: channels that contradict skin have met something else.
+    """
+    modelled = HIGHLIGHT_SIGMA * highlights.diffuse_share / highlights.diffuse_share.mean()
+    sampled = 1.0 / (highlights.precision * mean_intensity**2)
+    return np.sqrt(modelled**2 + sampled + (highlights.diffuse_share * MODEL_ERROR) ** 2)

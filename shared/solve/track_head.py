@@ -192,7 +192,8 @@ def _first_pass(clip, start, posed, settings, progress) -> tuple[BundleSolution,
         progress=lambda frames: progress(frames, "first tracks"),
     )
     points = points_on_grid(grid, where, start.points)
-    return _adjusted(clip, tracks, points, start.camera_from_points, 2.5 * settings.loss_scale_px, 2 * settings.prior_mm)
+    loss, prior = 2.5 * settings.loss_scale_px, 2.0 * settings.prior_mm
+    return _adjusted(clip, tracks, points, start.camera_from_points, loss, prior)
 
 
 def _mesh_pass(clip, model, solution, reliable, fit, settings, index, progress) -> tuple[BundleSolution, np.ndarray]:
