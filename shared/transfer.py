@@ -129,12 +129,19 @@ def bounce_nodes(mesh: Mesh, count: int) -> Nodes:
 
 
 def trace_transfer(
-    scene: RayScene, points: Points, nodes: Nodes, directions: np.ndarray, offset: float = 0.05, progress=iter
+    scene: RayScene,
+    points: Points,
+    nodes: Nodes,
+    directions: np.ndarray,
+    offset: float = 0.05,
+    progress=iter,
+    visibility: bool = True,
 ) -> Transfer:
     """Traces every direction above each point's horizon, once.
 
     directions [J, 3] unit, uniform (each 4 pi / J sr); offset: how far above the surface rays start, mm; progress:
-    wraps the sequence of batches to show how far it is.
+    wraps the sequence of batches to show how far it is; visibility off: every point sees all directions above its
+    horizon, as on a convex surface, and nothing bounces.
     """
     count, total = len(points), len(directions)
     direct = np.zeros((count, total), np.float16)
@@ -145,7 +152,7 @@ def trace_transfer(
     for start in progress(range(0, count, batch)):
         part = slice(start, min(start + batch, count))
         weight = np.maximum(points.normals[part] @ directions.T, 0.0) * (4.0 / total)
-        which, along = np.nonzero(weight > 0)
+        which, along = np.nonzero((weight > 0) & visibility)
         origins = (points.positions[part] + offset * points.normals[part])[which]
         face = scene.intersect(origins, directions[along])[0]
         hit = face >= 0

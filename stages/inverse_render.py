@@ -15,6 +15,8 @@ from __future__ import annotations
 from shared.contract import Job, Output, Parameter, Stage, main
 from shared.errors import LimnError
 
+LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
+
 STAGE = Stage(
     name="inverse_render",
     version=1,
@@ -34,12 +36,15 @@ STAGE = Stage(
         Parameter("map_size", int, 1024, "Edge of the maps; a power of two.", "texels",
                   choices=(64, 128, 256, 512, 1024, 2048, 4096, 8192)),
         Parameter("light_resolution", int, 16, "Edge of the light's cubemap faces.", "texels", choices=(4, 8, 16, 32)),
+        Parameter("light_model", str, "cubemap", "What is unknown of the light: every texel of a cubemap, spherical "
+                  "harmonics of its logarithm, one sun and a sky, or a lamp at the camera.", choices=LIGHT_MODELS),
         Parameter("points", int, 4000, "Surface points that the light is solved from.", "", 200, 40000),
         Parameter("directions", int, 768, "Directions over the sphere.", "", 128, 8192),
         Parameter("bounce_nodes", int, 1000, "Surface nodes that exchange bounced light.", "", 50, 6000),
         Parameter("light_frames", int, 48, "Frames that the light is solved from, spread evenly.", "frames", 3, 1000),
         Parameter("light_steps", int, 8, "Largest number of steps per resolution of the light.", "", 1, 100),
         Parameter("hold_out_every", int, 8, "One frame in so many is held out to judge the fit.", "frames", 3, 1000),
+        Parameter("visibility", bool, True, "Let parts of the head cover each other; off, nothing bounces either."),
         Parameter("bounce", bool, True, "Count light that bounces between parts of the head."),
         Parameter("specular", bool, True, "Model specular reflection."),
         Parameter("roughness", float, 0.45, "Roughness to start from.", "", 0.25, 0.7),
@@ -68,11 +73,13 @@ def read_settings(job: Job):
 
     params = job.params
     appearance = Settings(
+        light_model=params.light_model,
         resolutions=tuple(n for n in (8, 16, 32) if n <= params.light_resolution) or (params.light_resolution,),
         steps=params.light_steps,
         independent=params.evidence,
         priors=LightPriors(smooth=params.light_smoothness),
         white_sigma=params.white_light,
+        visibility=params.visibility,
         bounce=params.bounce,
         specular=params.specular,
         roughness=params.roughness,

@@ -116,7 +116,7 @@ def scale_free_error(found, true):
 
 def truly_lit(solver, capture):
     """What the solver's forward model gives under the true light and the true node albedo."""
-    solver.set_resolution(16)
+    solver.set_light(("cubemap", 16))
     solver.state.node_albedo = true_albedo(capture.nodes.points.positions)
     solver.bake()
     return solver.forward(true_light(cube_directions(16)))
@@ -188,7 +188,7 @@ def test_the_fit_is_deterministic(matte):
     capture, _, _ = matte
     settings = replace(MATTE, resolutions=(4,), steps=2)
     first, second = (fit_appearance(capture, settings).state for _ in range(2))
-    assert np.array_equal(first.log_light, second.log_light)
+    assert np.array_equal(first.params, second.params)
     assert np.array_equal(first.albedo, second.albedo)
 
 
@@ -287,7 +287,7 @@ def test_gradient_is_the_derivative_of_the_cost(truth, settings):
     solver = solver_of(truth[0], settings)
     solver.trust_highlights = settings.specular
     rng = np.random.default_rng(0)
-    solver.state.log_light = 0.6 * np.log(true_light(cube_directions(6)))
+    solver.state.params = 0.6 * np.log(true_light(cube_directions(6)))
     step = LightStep(solver)
     for _ in range(6 if settings.specular else 0):
         solver.state.specular = solver.highlights(step.irradiance, step.reflection, step.weight).pooled
@@ -296,7 +296,7 @@ def test_gradient_is_the_derivative_of_the_cost(truth, settings):
     for _ in range(6):
         change = rng.normal(size=gradient.shape)
         change *= 0.05 / np.linalg.norm(change)
-        ahead, behind = (step.cost(solver.state.log_light + sign * change) for sign in (1, -1))
+        ahead, behind = (step.cost(solver.state.params + sign * change) for sign in (1, -1))
         slopes.append((ahead - behind) / 2.0)
         expected.append((gradient * change).sum())
     assert np.allclose(slopes, expected, atol=(0.05 if settings.specular else 0.01) * np.abs(expected).max())
@@ -325,7 +325,7 @@ def test_steps_lower_the_cost_and_keep_the_mean_irradiance(matte):
     _, before, gauge = solver.mean_on_skin(step.albedo, step.irradiance)
     assert np.allclose((solver.state.light * gauge).sum(0), 1.0, rtol=1e-3)
     step.take()
-    assert step.cost(solver.state.log_light) < 0.5 * step.before
+    assert step.cost(solver.state.params) < 0.5 * step.before
     _, after, _ = solver.mean_on_skin(step.albedo, solver.forward(solver.state.light)[0])
     assert np.abs(after - before).max() < 0.5
 
@@ -335,7 +335,7 @@ def test_roughness_search_moves_towards_the_truth(truth):
     for start in (0.33, 0.5):
         solver = AppearanceSolver(capture, replace(MATTE, specular=True, resolutions=(16,), roughness=start))
         truly_lit_light = np.log(true_light(cube_directions(16)))
-        solver.state.log_light, solver.state.specular = truly_lit_light, SPECULAR
+        solver.state.params, solver.state.specular = truly_lit_light, SPECULAR
         solver.state.node_albedo = true_albedo(capture.nodes.points.positions)
         solver.bake()
         found = search_roughness(solver)

@@ -7,7 +7,8 @@ from shared.color import LUMINANCE
 from shared.envmap import cube_directions
 from shared.geometry import fibonacci_sphere, rotation_from_vector
 from shared.solve.capture import hold_out, spread_frames
-from shared.solve.light import FrameLight, LightPriors, resample_light
+from shared.solve.light import FrameLight, LightPriors, LogPrior, resample_light
+from shared.solve.light_models import make_light_model, real_harmonics
 from shared.solve.light_step import conjugate_gradients
 from shared.solve.scale import (
     REFERENCE_SKINS,
@@ -37,14 +38,14 @@ def test_frame_light_and_its_adjoint():
 
 
 def test_light_prior_gradient_and_null_space():
-    light, priors = FrameLight(4, DIRECTIONS[:8], np.eye(3)[None]), LightPriors(smooth=2.0, white=3.0, edge=0.4)
+    prior, priors = LogPrior(4), LightPriors(smooth=2.0, white=3.0, edge=0.4)
     rng = np.random.default_rng(4)
     log_light, change = rng.normal(size=(2, 96, 3))
-    _, gradient, product = light.prior(log_light, priors)
-    ahead, behind = (light.prior(log_light + sign * 1e-5 * change, priors)[0] for sign in (1, -1))
+    _, gradient, product = prior(log_light, priors)
+    ahead, behind = (prior(log_light + sign * 1e-5 * change, priors)[0] for sign in (1, -1))
     assert (ahead - behind) / 2e-5 == pytest.approx((gradient * change).sum(), rel=1e-6)
     assert (change * product(change)).sum() > 0
-    cost, gradient, _ = light.prior(np.full((96, 3), 1.7), priors)
+    cost, gradient, _ = prior(np.full((96, 3), 1.7), priors)
     assert cost == pytest.approx(0.0, abs=1e-12) and np.allclose(gradient, 0.0)
 
 
@@ -52,6 +53,74 @@ def test_resampled_light_keeps_its_shape():
     smooth = np.log(smooth_light(cube_directions(12)))
     assert np.abs(resample_light(smooth, 16) - np.log(smooth_light(cube_directions(16)))).max() < 0.1
     assert np.allclose(resample_light(smooth, 12), smooth)
+
+
+# ---------------------------------------------------------------------- models
+
+
+def test_harmonics_are_orthonormal():
+    from shared.envmap import cube_solid_angles
+
+    basis = real_harmonics(cube_directions(24), 4)
+    gram = (basis * cube_solid_angles(24)[:, None]).T @ basis
+    assert np.abs(gram - np.eye(25)).max() < 0.01
+    assert np.allclose(basis[:, 0], np.sqrt(0.25 / np.pi))
+    # Degree 1 with y up: (y, z, x) up to the factor sqrt(3 / 4 pi) and signs.
+    assert np.allclose(np.abs(basis[:, [3, 1, 2]]), np.sqrt(0.75 / np.pi) * np.abs(cube_directions(24))[:, [2, 0, 1]])
+
+
+MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
+
+
+def some_light(name):
+    """A model with parameters in general position, and a random change of them."""
+    model = make_light_model(name, 6)
+    rng = np.random.default_rng(5)
+    params = model.fit(smooth_light(cube_directions(8)))
+    return model, params + 0.1 * rng.normal(size=params.shape), rng.normal(size=params.shape)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_light_models_have_the_derivatives_they_state(name):
+    model, params, change = some_light(name)
+    ahead, behind = (model.radiance(params + sign * 1e-5 * change) for sign in (1, -1))
+    tangent = model.tangent(params, change)
+    assert np.allclose((ahead - behind) / 2e-5, tangent, rtol=1e-4, atol=1e-6)
+    values = np.random.default_rng(6).normal(size=tangent.shape)
+    assert (values * tangent).sum() == pytest.approx((model.adjoint(params, values) * change).sum(), rel=1e-9)
+    priors = LightPriors(smooth=2.0, white=3.0)
+    _, gradient, product = model.prior(params, priors)
+    ahead, behind = (model.prior(params + sign * 1e-5 * change, priors)[0] for sign in (1, -1))
+    assert (ahead - behind) / 2e-5 == pytest.approx((gradient * change).sum(), rel=1e-5)
+    assert (change * product(change)).sum() > 0
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_light_models_scale_by_their_unit(name):
+    model, params, _ = some_light(name)
+    factor = np.array([0.2, -0.1, 0.4])
+    assert np.allclose(model.radiance(model.scaled(params, factor)), np.exp(factor) * model.radiance(params))
+    assert np.allclose(model.tangent(params, model.unit * np.ones(3)), model.radiance(params))
+
+
+def test_light_models_find_their_own_light():
+    """A low sun in a gradient sky is found as such; harmonics of order 4 come closer to it than of order 2."""
+    towards = np.array([0.6, 0.48, 0.64])
+    directions = cube_directions(16)
+    sky = np.exp(0.3 * directions[:, 1:2]) * [0.4, 0.5, 0.7]
+    light = sky + np.exp(80.0 * (directions @ towards - 1.0))[:, None] * [30.0, 25.0, 18.0]
+    sun = make_light_model("sun_sky", 16)
+    params = sun.fit(light)
+    found = params[-1] / np.linalg.norm(params[-1])
+    assert found @ towards > np.cos(np.radians(6.0))
+    assert np.allclose(np.exp(params[-2]), [30.0, 25.0, 18.0], rtol=0.15)
+    errors = [np.square(np.log(m.radiance(m.fit(light)) / light)).mean() for m in (
+        make_light_model("harmonics_2", 16), make_light_model("harmonics_4", 16), make_light_model("cubemap", 16))]
+    assert errors[0] > 1.2 * errors[1] > errors[2] and errors[2] < 1e-12
+    camera = make_light_model("camera", 16)
+    lit = camera.radiance(np.array([[-1.0] * 3, [2.0] * 3]))
+    assert directions[lit.sum(1).argmax()] @ [0, 0, 1] > np.cos(np.radians(6.0))
+    assert np.allclose(camera.fit(lit), [[-1.0] * 3, [2.0] * 3], atol=0.1)
 
 
 # ---------------------------------------------------------------------- scale

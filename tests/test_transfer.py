@@ -135,6 +135,17 @@ def test_exchange_between_nodes_is_mutual(traced_bowl):
     assert forth == pytest.approx(back, rel=0.05)
 
 
+def test_without_visibility_a_bowl_is_lit_like_a_convex_surface(traced_bowl):
+    """Switched off, direct transfer of a concave surface sums to 1 and nothing bounces; switched on it does not."""
+    mesh, nodes, _, seeing = traced_bowl
+    inner = np.nonzero(mesh.vertices[:, 2] < -0.1 * RADIUS)[0][::3]
+    scene = RayScene(mesh.vertices, mesh.faces)
+    blind = trace_transfer(scene, mesh_points(mesh, inner), nodes, DIRECTIONS, visibility=False)
+    assert np.allclose(blind.direct.astype(np.float64).sum(1), 1.0, atol=0.01)
+    assert not blind.bounce.any() and not blind.blocked.any()
+    assert seeing.direct.astype(np.float64).sum(1).max() < 0.6
+
+
 def test_a_square_overhead_shades_as_it_should():
     """Configuration factor of a square, half side s, at height h over a point: four times the corner's."""
     half, height = 60.0, 40.0

@@ -1,7 +1,7 @@
 """Light, albedo, specular intensity and roughness from the samples of a whole clip.
 
 Model of point v, frame f, channel c:  a[v, c] E[v, f, c] + s S[v, f, c], with E the irradiance over pi (visibility and
-all diffuse bounces) and S the specular lobe sum, both linear in the light. Unknown: the light's logarithm, one
+all diffuse bounces) and S the specular lobe sum, both linear in the light. Unknown: the light's parameters, one
 specular intensity s, one roughness, the albedo of each point.
 
 Method. Albedo is eliminated: for any light it is a weighted least-squares solution per point and channel, and only
@@ -24,7 +24,8 @@ import torch
 from shared.brdf import hemispherical_albedo
 from shared.gather import Samples
 from shared.lobes import LobeTable, specular_tables
-from shared.solve.light import FrameLight, LightPriors, resample_light
+from shared.solve.light import FrameLight, LightPriors
+from shared.solve.light_models import LampLight, LogLight, make_light_model
 from shared.solve.scale import Highlights, most_likely_irradiance
 from shared.transfer import Nodes, Points, Transfer, nearest_points, node_radiosity
 
@@ -35,20 +36,34 @@ ALBEDO_PULL = 25.0
 
 @dataclass(frozen=True)
 class Settings:
-    """resolutions: cubemap edge per stage of the solve; independent: how many of the samples count as independent
-    evidence against the priors; noise: absolute and relative standard deviation of a sample."""
+    """light_model: see light_models; resolutions: cubemap edge per stage of the solve; independent: how many of the
+    samples count as independent evidence against the priors; noise: absolute and relative standard deviation of a
+    sample; visibility: whether parts of the head cover each other."""
 
+    light_model: str = "cubemap"
     resolutions: tuple[int, ...] = (8, 16)
     steps: int = 8
     independent: float = 5000.0
     noise: tuple[float, float] = (0.006, 0.03)
     priors: LightPriors = field(default_factory=LightPriors)
     white_sigma: float = 0.15
+    visibility: bool = True
     bounce: bool = True
     specular: bool = True
     roughness: float = 0.45
     search_roughness: bool = True
     specular_prior: tuple[float, float] = (0.7, 0.25)
+
+    def light_moves(self, moves: str) -> str:
+        """What moves against the light: a lamp at the camera goes with it, so that the head moves in any capture."""
+        return "head" if self.light_model == "camera" else moves
+
+    @property
+    def light_schedule(self) -> tuple[tuple[str, int], ...]:
+        """(model, resolution) per stage; models with a few numbers start from a coarse cubemap."""
+        if self.light_model == "cubemap":
+            return tuple(("cubemap", resolution) for resolution in self.resolutions)
+        return ("cubemap", self.resolutions[0]), (self.light_model, self.resolutions[-1])
 
 
 @dataclass(frozen=True)
@@ -73,9 +88,11 @@ class Capture:
 
 @dataclass
 class State:
-    """log_light [6 n^2, 3], specular intensity, roughness, albedo [P, 3], node_albedo [K, 3]."""
+    """The light's parameters [M, 3] and the model they belong to, specular intensity, roughness, albedo [P, 3],
+    node_albedo [K, 3]."""
 
-    log_light: np.ndarray
+    params: np.ndarray
+    light_model: LogLight | LampLight
     specular: float
     roughness: float
     albedo: np.ndarray
@@ -84,7 +101,7 @@ class State:
     @property
     def light(self) -> np.ndarray:
         """[6 n^2, 3] radiance."""
-        return np.exp(self.log_light)
+        return self.light_model.radiance(self.params)
 
 
 def _channel_first(array: np.ndarray) -> torch.Tensor:
@@ -110,7 +127,7 @@ class AppearanceSolver:
         self.trust_highlights = False
         self.lobes: torch.Tensor | None = None
         self.state = self._start()
-        self.set_resolution(settings.resolutions[0])
+        self.set_light(settings.light_schedule[0])
 
     # ------------------------------------------------------------------ set-up
     def _start(self) -> State:
@@ -120,19 +137,21 @@ class AppearanceSolver:
         open_share = float((self.direct.sum(1) * weight[0].sum(1)).sum() / weight.sum())
         irradiance = np.exp(most_likely_irradiance(np.log(radiance), self.settings.white_sigma))
         albedo = radiance / irradiance
-        log_light = np.broadcast_to(np.log(irradiance / open_share), (6 * self.settings.resolutions[0] ** 2, 3)).copy()
+        resolution = self.settings.light_schedule[0][1]
+        log_light = np.broadcast_to(np.log(irradiance / open_share), (6 * resolution**2, 3)).copy()
         points, nodes = len(self.capture.points), len(self.capture.nodes.points)
         specular = self.settings.specular_prior[0] if self.settings.specular else 0.0
         everywhere = (np.tile(albedo, (count, 1)) for count in (points, nodes))
-        return State(log_light, specular, self.settings.roughness, *everywhere)
+        return State(log_light, LogLight(resolution), specular, self.settings.roughness, *everywhere)
 
     def _skin(self) -> torch.Tensor:
         return torch.from_numpy(self.capture.skin.astype(np.float32))[None, :, None]
 
-    def set_resolution(self, resolution: int) -> None:
-        self.frame_light = FrameLight(resolution, self.capture.directions, self.capture.world_from_head)
-        if len(self.state.log_light) != self.frame_light.texels:
-            self.state.log_light = resample_light(self.state.log_light, resolution)
+    def set_light(self, stage: tuple[str, int]) -> None:
+        """Goes on with a light of another model or resolution, as close to the present one as it can be."""
+        model = make_light_model(*stage)
+        self.frame_light = FrameLight(model.resolution, self.capture.directions, self.capture.world_from_head)
+        self.state.params, self.state.light_model = model.fit(self.state.light), model
 
     def subset(self, index: slice) -> AppearanceSolver:
         """A solver of some of the points that shares the rest, with a state of its own."""

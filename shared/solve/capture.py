@@ -9,8 +9,17 @@ import numpy as np
 
 from shared.gather import Picture, SurfaceViewer, gather_samples
 from shared.geometry import fibonacci_sphere, world_from_head
+from shared.raycast import RayScene
 from shared.solve.appearance import Capture
-from shared.transfer import Nodes, Transfer, bounce_nodes, mesh_points, spread_vertices, trace_transfer
+from shared.transfer import (
+    Nodes,
+    Points,
+    Transfer,
+    bounce_nodes,
+    mesh_points,
+    spread_vertices,
+    trace_transfer,
+)
 
 MINIMUM_FRAMES = 4
 _DEEP = 0.9
@@ -27,18 +36,28 @@ class Sizes:
 
 @dataclass(frozen=True)
 class Scenery:
-    """What does not depend on the frames: directions [J, 3], bounce nodes and their transfer."""
+    """What does not depend on the frames: directions [J, 3], bounce nodes and their transfer, whether parts of the
+    head cover each other."""
 
+    scene: RayScene
     directions: np.ndarray
     nodes: Nodes
     node_transfer: Transfer
+    visibility: bool = True
+
+    def trace(self, points: Points, progress: Callable = iter) -> Transfer:
+        """The transfer of surface points along the directions."""
+        return trace_transfer(
+            self.scene, points, self.nodes, self.directions, progress=progress, visibility=self.visibility
+        )
 
 
-def set_scenery(viewer: SurfaceViewer, sizes: Sizes) -> Scenery:
-    """Directions and bounce nodes of a mesh, traced."""
+def set_scenery(viewer: SurfaceViewer, sizes: Sizes, visibility: bool = True) -> Scenery:
+    """Directions and bounce nodes of a mesh, traced; visibility off: see trace_transfer."""
     directions = fibonacci_sphere(sizes.directions)
     nodes = bounce_nodes(viewer.mesh, sizes.nodes)
-    return Scenery(directions, nodes, trace_transfer(viewer.scene, nodes.points, nodes, directions))
+    node_transfer = trace_transfer(viewer.scene, nodes.points, nodes, directions, visibility=visibility)
+    return Scenery(viewer.scene, directions, nodes, node_transfer, visibility)
 
 
 def spread_frames(count: int, wanted: int) -> np.ndarray:
@@ -88,7 +107,7 @@ def build_capture(
     samples = gather_samples(viewer, index, pictures, camera_from_head, intrinsics)
     seen = (samples.weight[:, fitted] > 0).sum(1) >= min(MINIMUM_FRAMES, int(fitted.sum()))
     points = mesh_points(viewer.mesh, index[seen])
-    transfer = trace_transfer(viewer.scene, points, scenery.nodes, scenery.directions, progress=progress)
+    transfer = scenery.trace(points, progress)
     shallow = np.nonzero(transfer.blocked < _DEEP)[0]
     chosen = np.nonzero(seen)[0][shallow]
     return Capture(

@@ -35,21 +35,21 @@ def fit_appearance(
     """Fits light, albedo, specular intensity and roughness; report receives each step's record.
 
     The first steps only give the light its shape; highlights, which then begin to say something about scale and
-    roughness, take part from the fourth. Only states after that can win.
+    roughness, take part from the fourth. Only states after that, of the light model asked for, can win.
     """
     solver = AppearanceSolver(capture, settings)
     judges = not capture.fitted.all()  # a clip too short to hold frames out is judged by the fitted ones
     records, best = [], None
-    for stage, resolution in enumerate(settings.resolutions):
-        solver.set_resolution(resolution)
+    for stage, (model, resolution) in enumerate(settings.light_schedule):
+        solver.set_light((model, resolution))
         last, least = np.inf, SHAPING_STEPS + 2 if stage == 0 else 1
         for number in range(settings.steps):
             shaping = stage == 0 and number < min(SHAPING_STEPS, settings.steps - 1)
-            record = _step(solver, settings, shaping) | {"resolution": resolution, "step": number}
+            record = _step(solver, settings, shaping) | {"light": model, "resolution": resolution, "step": number}
             records.append(record)
             report(record)
             judged = record["held_out" if judges else "fitted"]
-            if not shaping and (best is None or judged < best[0]):
+            if not shaping and model == settings.light_model and (best is None or judged < best[0]):
                 best = (judged, record, _copy(solver.state))
             if not shaping and number >= least and judged > last * (1.0 - _WORTHWHILE):
                 break
@@ -82,7 +82,7 @@ def _step(solver: AppearanceSolver, settings: Settings, shaping: bool) -> dict:
 
 
 def _copy(state: State) -> State:
-    return replace(state, log_light=state.log_light.copy(), albedo=state.albedo.copy())
+    return replace(state, params=state.params.copy(), albedo=state.albedo.copy())
 
 
 def search_roughness(solver: AppearanceSolver, stride: int = 4) -> float:

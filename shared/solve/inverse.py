@@ -27,7 +27,7 @@ from shared.solve.fit_appearance import Solution, fit_appearance
 from shared.solve.texture import TexelMaterial
 from shared.solve.texture_pass import Clip, TexturePass
 from shared.texels import TexelSurface
-from shared.transfer import mesh_points, trace_transfer
+from shared.transfer import mesh_points
 
 FACE_SKIN = ("forehead", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "chin", "jaw")
 """Segments whose skin the light is solved from; hair, brows, lips, lids, eyes and what
@@ -83,7 +83,7 @@ class InverseResult:
 def solve_clip(inputs: InverseInputs, settings: InverseSettings, progress: Callable, note: Callable) -> InverseResult:
     """The whole of it. progress(items, label) wraps loops, note(text) logs a line."""
     viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
-    scenery = set_scenery(viewer, settings.sizes)
+    scenery = set_scenery(viewer, settings.sizes, settings.appearance.visibility)
     fitted = hold_out(len(inputs.camera_from_head), settings.hold_out_every)
     solution = _solve_light(inputs, settings, viewer, scenery, fitted, progress, note)
     shading = shade_vertices(inputs, settings.appearance, viewer, scenery, solution, progress)
@@ -118,7 +118,7 @@ def _solve_light(inputs, settings, viewer, scenery: Scenery, fitted, progress, n
         (inputs.picture(f) for f in progress(chosen, "gathering samples")),
         inputs.camera_from_head[chosen],
         inputs.intrinsics,
-        inputs.moves,
+        settings.appearance.light_moves(inputs.moves),
         kept,
         allowed=skin,
         skin=skin,
@@ -128,9 +128,15 @@ def _solve_light(inputs, settings, viewer, scenery: Scenery, fitted, progress, n
     return fit_appearance(capture, settings.appearance, lambda record: note(_describe(record)))
 
 
+def describe_light(state) -> str:
+    """The light's model in words."""
+    model, numbers = state.light_model, len(state.params)
+    return f"cubemap of 6 x {model.resolution}^2 texels from {numbers} numbers per channel"
+
+
 def _describe(record: dict) -> str:
     return (
-        f"light {record['resolution']}, step {record['step']}: residual {record['fitted']:.5f} fitted, "
+        f"{record['light']} {record['resolution']}, step {record['step']}: residual {record['fitted']:.5f} fitted, "
         f"{record['held_out']:.5f} held out; specular {record['specular_intensity']:.3f}, "
         f"roughness {record['roughness']:.3f}"
     )
@@ -142,13 +148,7 @@ def shade_vertices(
     """Shading of all vertices that some frame faces, in all frames."""
     index = np.nonzero(face_front(viewer, inputs.camera_from_head, -0.1))[0]
     points = mesh_points(viewer.mesh, index)
-    transfer = trace_transfer(
-        viewer.scene,
-        points,
-        scenery.nodes,
-        scenery.directions,
-        progress=lambda batches: progress(batches, "tracing the surface"),
-    )
+    transfer = scenery.trace(points, lambda batches: progress(batches, "tracing the surface"))
     state = solution.state
     return VertexShading(
         index,
@@ -160,7 +160,7 @@ def shade_vertices(
         state.light,
         scenery.directions,
         inputs.camera_from_head,
-        inputs.moves,
+        appearance.light_moves(inputs.moves),
         bounce=appearance.bounce,
     )
 
@@ -185,7 +185,7 @@ def summarise(inputs: InverseInputs, result: InverseResult, frame_index: np.ndar
     seen = result.material.information > 1.0
     return {
         "model": {
-            "light": f"cubemap of 6 x {round((len(state.log_light) / 6) ** 0.5)}^2 texels",
+            "light": describe_light(state),
             "specular_intensity": round(state.specular, 4),
             "specular_variation": result.record["texture"]["chosen"],
             "roughness": round(state.roughness, 4),

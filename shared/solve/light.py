@@ -1,12 +1,12 @@
-"""The unknown light: a cubemap in the logarithm, how each frame sees it, and its regularisers.
+"""How each frame sees the light, and the regularisers on its logarithm.
 
-The logarithm keeps radiance positive and makes smoothness relative, so that a lamp a thousand times brighter than the
-room costs no more than its edge. Looking the cubemap up along the head-space directions of every frame is one sparse
-matrix; the solver needs only products with it and with its transpose.
+Looking the cubemap up along the head-space directions of every frame is one sparse matrix; the solver needs only
+products with it and with its transpose. What is unknown of the light is the business of shared.solve.light_models.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,8 +37,6 @@ class FrameLight:
         turned = np.einsum("fij,dj->dfi", world_from_head, directions).reshape(-1, 3)
         self._lookup = cube_lookup(turned, resolution).astype(np.float32)
         self._transposed = self._lookup.T.tocsr()
-        self._differences = cube_smoothness(resolution)
-        self._solid = cube_solid_angles(resolution) / (4.0 * np.pi)
 
     def along(self, light: np.ndarray) -> np.ndarray:
         """Radiance of the texels [K, C] -> along each direction in each frame [J, F, C] float32."""
@@ -48,8 +46,16 @@ class FrameLight:
         """The transpose of along: [J, F, C] -> [K, C] float64."""
         return (self._transposed @ values.reshape(-1, values.shape[-1])).astype(np.float64)
 
-    def prior(self, log_light: np.ndarray, priors: LightPriors) -> tuple[float, np.ndarray, object]:
-        """Cost, gradient [K, C] and Hessian product (a function) of the regularisers at log_light [K, C].
+
+class LogPrior:
+    """Regularisers of a cubemap's log radiance: smooth with room for edges, and grey."""
+
+    def __init__(self, resolution: int):
+        self._differences = cube_smoothness(resolution)
+        self._solid = cube_solid_angles(resolution) / (4.0 * np.pi)
+
+    def __call__(self, log_light: np.ndarray, priors: LightPriors) -> tuple[float, np.ndarray, Callable]:
+        """Cost, gradient [K, C] and Hessian product (a function) at log_light [K, C].
 
         Pseudo-Huber on neighbour differences, its weights held for the Hessian (iteratively reweighted squares).
         """

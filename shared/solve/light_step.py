@@ -1,4 +1,4 @@
-"""One Gauss-Newton step of the log light with the albedo eliminated, and the loop around it.
+"""One Gauss-Newton step of the light's parameters with the albedo eliminated, and the loop around it.
 
 The step solves (J^T W J + priors) d = -gradient by conjugate gradients. J is never formed: its product with a change
 of light renders that change for all points and frames and removes what a change of albedo would absorb. J W-projects
@@ -52,6 +52,7 @@ class LightStep:
 
     def __init__(self, solver: AppearanceSolver):
         self.solver = solver
+        self.model = solver.state.light_model
         self.light = solver.state.light
         self.irradiance, self.reflection = solver.forward(self.light)
         self.weight = solver.weights(solver.model(self.irradiance, self.reflection)) * solver.fitted
@@ -78,27 +79,27 @@ class LightStep:
             log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma
         )
         factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]
-        solver.state.log_light = solver.state.log_light + log_factor
+        solver.state.params = self.model.scaled(solver.state.params, log_factor)
         solver.state.specular = specular if settings.specular else 0.0
         self.irradiance, self.reflection = self.irradiance * factor, self.reflection * factor
         self._fit_points()
 
-    def cost(self, log_light: np.ndarray) -> float:
+    def cost(self, params: np.ndarray) -> float:
         """Data and priors with albedo and, once highlights count, specular intensity eliminated; weights held."""
         solver = self.solver
-        irradiance, reflection = solver.forward(np.exp(log_light))
+        irradiance, reflection = solver.forward(self.model.radiance(params))
         specular = solver.state.specular
         if solver.trust_highlights:
             specular = solver.highlights(irradiance, reflection, self.weight).pooled
         albedo = solver.eliminate(irradiance, reflection, self.weight, specular)
         model = albedo * irradiance + specular * reflection
         data = 0.5 * self.evidence * float((self.weight * (model - solver.colours).square()).sum())
-        return data + solver.frame_light.prior(log_light, solver.settings.priors)[0]
+        return data + self.model.prior(params, solver.settings.priors)[0]
 
     def _render(self, change: np.ndarray) -> torch.Tensor:
-        """Change of the model [3, P, F] for a change of log light [K, 3], out of the eliminated unknowns' reach."""
+        """Change of the model [3, P, F] with the parameters [M, 3], out of the eliminated unknowns' reach."""
         solver = self.solver
-        along = torch.from_numpy(solver.frame_light.along(self.light * change))
+        along = torch.from_numpy(solver.frame_light.along(self.model.tangent(solver.state.params, change)))
         result = self.albedo * torch.bmm(solver.baked, along.permute(2, 0, 1).contiguous())
         if solver.settings.specular:
             result += solver.state.specular * solver.reflect(along)
@@ -109,49 +110,51 @@ class LightStep:
         return result
 
     def _adjoint(self, values: torch.Tensor) -> np.ndarray:
-        """Transpose of the unprojected rendering: [3, P, F] -> [K, 3]."""
+        """Transpose of the unprojected rendering: [3, P, F] -> [M, 3]."""
         solver = self.solver
         along = torch.bmm(solver.baked.transpose(1, 2), self.albedo * values).permute(1, 2, 0)
         if solver.settings.specular:
             along = along + solver.state.specular * solver.reflect_adjoint(values)
-        return self.light * solver.frame_light.adjoint(along.contiguous().numpy())
+        return self.model.adjoint(solver.state.params, solver.frame_light.adjoint(along.contiguous().numpy()))
 
     def gradient(self) -> np.ndarray:
-        """[K, 3] derivative of cost by the log light."""
+        """[M, 3] derivative of cost by the parameters."""
         solver, state = self.solver, self.solver.state
         error = self.albedo * self.irradiance + state.specular * self.reflection - solver.colours
         data = self.evidence * self._adjoint(self.weight * error)
-        _, prior, self.prior_product = solver.frame_light.prior(state.log_light, solver.settings.priors)
+        _, prior, self.prior_product = self.model.prior(state.params, solver.settings.priors)
         return data + prior
 
     def product(self, change: np.ndarray) -> np.ndarray:
-        """Gauss-Newton Hessian times a change [K, 3]."""
+        """Gauss-Newton Hessian times a change [M, 3]."""
         return self.evidence * self._adjoint(self.weight * self._render(change)) + self.prior_product(change)
 
     def take(self, products: int = 15) -> None:
-        """Moves the solver's log light at constant mean irradiance per channel; halved until the cost falls.
+        """Moves the solver's light at constant mean irradiance per channel; halved until the cost falls.
 
-        The scale is left to settle: steps x are taken as Q x with Q = 1 - 1 g', where g is the derivative of the log
-        mean irradiance (it sums to 1), so that g' Q x = 0.
+        The scale is left to settle: steps x are taken as Q x with Q = 1 - u g', where u raises the log light by one
+        and g is the derivative of the log mean irradiance (g' u = 1), so that g' Q x = 0.
         """
         state = self.solver.state
-        gauge = self.light * self.solver.mean_on_skin(self.albedo, self.irradiance)[2]
+        gauge = self.model.adjoint(state.params, self.solver.mean_on_skin(self.albedo, self.irradiance)[2])
+        gauge[self.model.moving_rows] = 0.0
+        unit = self.model.unit
 
         def level(change: np.ndarray) -> np.ndarray:
-            return change - (gauge * change).sum(0)
+            return change - unit * (gauge * change).sum(0)
 
         def level_transposed(change: np.ndarray) -> np.ndarray:
-            return change - gauge * change.sum(0)
+            return change - gauge * (unit * change).sum(0)
 
         right = -level_transposed(self.gradient())
         solved = conjugate_gradients(lambda x: level_transposed(self.product(level(x))), right, products)
         step = level(solved)
         step *= min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-9))
-        self.before = self.cost(state.log_light)
+        self.before = self.cost(state.params)
         for _ in range(6):
-            if self.cost(state.log_light + step) < self.before:
+            if self.cost(state.params + step) < self.before:
                 break
             step *= 0.5
         else:
             step *= 0.0
-        state.log_light = state.log_light + step
+        state.params = state.params + step
