@@ -140,15 +140,17 @@ def sample_colours(picture: Picture, pixels: np.ndarray, footprint: np.ndarray |
     colours = np.maximum(_remap(picture.levels[0], pixels, cv2.INTER_CUBIC), 0.0)
     if footprint is None or float(footprint.max(initial=0.0)) <= 1.0:
         return colours
-    level = np.clip(np.log2(np.maximum(footprint, 1.0)), 0.0, len(picture.levels) - 1.0)
-    below = np.minimum(level.astype(int), len(picture.levels) - 2)
-    full = np.array(picture.levels[0].shape[1::-1], np.float64)
-    stack = [colours]
-    for image in picture.levels[1 : below.max() + 2]:
-        stack.append(_remap(image, pixels * (np.array(image.shape[1::-1]) / full), cv2.INTER_LINEAR))
-    stack = np.stack(stack)
-    index, blend = np.arange(len(pixels)), (level - below)[:, None].astype(np.float32)
-    return stack[below, index] * (1.0 - blend) + stack[below + 1, index] * blend
+    level = np.log2(np.maximum(footprint, 1.0)).astype(np.float32)
+    full = np.array(picture.levels[0].shape[1::-1], np.float32)
+    for k, image in enumerate(picture.levels[1:]):
+        wide = np.nonzero(level > k)[0]
+        if len(wide) == 0:
+            break
+        size = np.array(image.shape[1::-1], np.float32)
+        coarse = _remap(image, pixels[wide] * (size / full), cv2.INTER_LINEAR)
+        blend = np.minimum(level[wide] - k, 1.0)[:, None]
+        colours[wide] += blend * (coarse - colours[wide])
+    return colours
 
 
 def sample_limits(picture: Picture, pixels: np.ndarray) -> np.ndarray:

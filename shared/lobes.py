@@ -3,8 +3,9 @@
     S[v, f] = sum_j V[v, j] f_GGX(n_v, o_vf, w_j) cos_i dw L_f[j]
 
 at specular_intensity 1, with the same visibility and light as the diffuse transfer. The set resolves lobes that are
-wider than its spacing (sqrt(4 pi / J)): with 768 directions roughness 0.3 and up; skin lies above. Where the head
-itself blocks the lobe, the blocked weight is returned too, so that the caller can fill in light that bounced.
+wider than its spacing (sqrt(4 pi / J)): with 768 directions roughness 0.25 and up; skin lies above. Narrower lobes
+(wet lips, oil, eyes) get their weights from the split sum. Where the head itself blocks the lobe, the blocked weight
+is returned too, so that the caller can fill in light that bounced.
 
 The tables for the solver are kept as bfloat16 [F, P, J] (2 bytes per entry): rounding errors are independent between
 directions and average out in the sum.
@@ -18,6 +19,7 @@ import numpy as np
 import torch
 
 from shared.brdf import F0, MINIMUM_COSINE
+from shared.split_sum import SplitSum, narrowest_roughness
 
 _VALUES_PER_BLOCK = 32768
 """Small enough for the cache; larger blocks are bound by memory and no faster on two threads than these on one."""
@@ -34,6 +36,8 @@ class LobeTable:
         self.directions = torch.from_numpy(np.ascontiguousarray(directions.T, np.float32))
         self.visible = torch.from_numpy(np.ascontiguousarray(visible))
         self.solid_angle = 4.0 * np.pi / len(directions)
+        self.narrowest = narrowest_roughness(len(directions))
+        self._split_sum: SplitSum | None = None
 
     def take(self, index: np.ndarray) -> LobeTable:
         """The table of the points at index."""
@@ -48,8 +52,13 @@ class LobeTable:
         """Lobe weights of some points from one view each: all directions [p, J], and the open share [p, J].
 
         towards [p, 3] unit vectors to the camera. The first includes directions that the head blocks. The same
-        function as brdf.specular_cosine times the solid angle, with what does not change factored out.
+        function as brdf.specular_cosine times the solid angle, with what does not change factored out; for lobes that
+        slip between the directions the split sum.
         """
+        if roughness < self.narrowest:
+            if self._split_sum is None:
+                self._split_sum = SplitSum(self.directions.numpy().T.astype(np.float64))
+            return self._split_sum.kernel(self.normals[part], towards, float(roughness), self.visible[part])
         alpha2 = float(roughness) ** 4
         normals = self.normals[part]
         n_dot_i = normals @ self.directions

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
+import torch
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse.linalg import spsolve
 
 from shared.gather import Picture, View, sample_colours, sample_inside, sample_limits, texel_size
-from shared.geometry import project
-from shared.mesh import Mesh, interpolate, rasterize_uv, uniform_laplacian
+from shared.mesh import Mesh, rasterize_uv, uniform_laplacian
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class TexelSamples:
 
 
 class TexelSurface:
-    """The T texels of a size x size map that lie on the mesh: face [T], bary [T, 3], position [T, 3] mm."""
+    """The T texels of a size x size map that lie on the mesh: face [T], bary [T, 3]."""
 
     def __init__(self, mesh: Mesh, size: int):
         self.mesh, self.size = mesh, size
@@ -33,15 +33,19 @@ class TexelSurface:
         # Faces without area in the layout give no corner weights.
         self.pixel = np.nonzero((face >= 0).ravel() & np.isfinite(bary).all(-1).ravel())[0]
         self.face, self.bary = face.ravel()[self.pixel], bary.reshape(-1, 3)[self.pixel]
-        self.position = interpolate(mesh.vertices.astype(np.float32), mesh.faces, self.face, self.bary)
-        self._texel_mm = texel_size(mesh, size).astype(np.float32)
+        self._corners = torch.from_numpy(np.ascontiguousarray(mesh.faces[self.face], np.int32))
+        self._corner_weights = torch.from_numpy(np.ascontiguousarray(self.bary, np.float32))
+        self._texel_mm = texel_size(mesh, size).astype(np.float32)[self.face]
 
     def __len__(self) -> int:
         return len(self.pixel)
 
     def interpolate(self, values: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Vertex values [V, ...] at some texels."""
-        return interpolate(values, self.mesh.faces, self.face[rows], self.bary[rows])
+        """Vertex values [V, C] at some texels -> [n, C] float32."""
+        table = torch.from_numpy(np.ascontiguousarray(values, np.float32))
+        chosen = rows if isinstance(rows, slice) else torch.from_numpy(rows)
+        corners, weights = self._corners[chosen], self._corner_weights[chosen]
+        return torch.nn.functional.embedding_bag(corners, table, per_sample_weights=weights, mode="sum").numpy()
 
     def to_image(self, values: np.ndarray, elsewhere: float = 0.0) -> np.ndarray:
         """[T, ...] -> [size, size, ...]."""
@@ -59,16 +63,23 @@ class TexelSurface:
         return image[rows, columns]
 
     def samples(
-        self, view: View, picture: Picture, camera_from_head: np.ndarray, intrinsics: np.ndarray
-    ) -> TexelSamples:
-        """What one frame shows of the texels; a face counts as seen when all its corners are."""
+        self, view: View, picture: Picture, intrinsics: np.ndarray, shade: np.ndarray | None = None
+    ) -> tuple[TexelSamples, np.ndarray]:
+        """What one frame shows of the texels; a face counts as seen when all its corners are.
+
+        shade [V, C]: vertex values to interpolate on the way -> samples, and shade at them [n, C] (C = 0 without).
+        """
         seen_face = (view.weight > 0)[self.mesh.faces].all(1)
         rows = np.nonzero(seen_face[self.face])[0]
-        pixels, depth = project(self.position[rows], camera_from_head, intrinsics)
-        footprint = self._texel_mm[self.face[rows]] * intrinsics[0, 0] / depth
-        weight = self.interpolate(view.weight, rows) * sample_inside(picture, pixels)
+        # Depth times pixel is linear on the surface; the pixel itself is not.
+        depth = view.depth[:, None]
+        columns = [view.pixels * depth, depth, view.weight[:, None]] + ([] if shade is None else [shade])
+        found = self.interpolate(np.concatenate(columns, axis=1), rows)
+        pixels = found[:, :2] / found[:, 2:3]
+        footprint = self._texel_mm[rows] * np.float32(intrinsics[0, 0]) / found[:, 2]
+        weight = found[:, 3] * sample_inside(picture, pixels)
         colours = sample_colours(picture, pixels, footprint)
-        return TexelSamples(rows, colours, weight.astype(np.float32), sample_limits(picture, pixels))
+        return TexelSamples(rows, colours, weight, sample_limits(picture, pixels)), found[:, 4:]
 
     def to_vertices(self, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Weighted means of texel values [T, C] around each vertex; weight [T, C] -> means and total weights [V, C]."""

@@ -46,7 +46,7 @@ def average_frames(job: Job, inputs, surface, viewer) -> tuple:
     for f in job.progress(chosen, "projecting frames", total=len(chosen)):
         picture, pose = inputs.picture(f), inputs.camera_from_head[f]
         view = viewer.view(pose, inputs.intrinsics, inputs.size)
-        samples = surface.samples(view, picture, pose, inputs.intrinsics)
+        samples, _ = surface.samples(view, picture, inputs.intrinsics)
         total[samples.rows] += samples.weight[:, None] * samples.colours
         weight[samples.rows] += samples.weight
     return total / np.maximum(weight, 1e-6)[:, None], weight

@@ -19,7 +19,7 @@ LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 STAGE = Stage(
     name="inverse_render",
-    version=1,
+    version=2,
     help="Light, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     outputs=(
@@ -42,12 +42,12 @@ STAGE = Stage(
         Parameter("directions", int, 768, "Directions over the sphere.", "", 128, 8192),
         Parameter("bounce_nodes", int, 1000, "Surface nodes that exchange bounced light.", "", 50, 6000),
         Parameter("light_frames", int, 48, "Frames that the light is solved from, spread evenly.", "frames", 3, 1000),
-        Parameter("light_steps", int, 8, "Largest number of steps per resolution of the light.", "", 1, 100),
+        Parameter("light_steps", int, 20, "Largest number of steps per resolution of the light.", "", 1, 100),
         Parameter("hold_out_every", int, 8, "One frame in so many is held out to judge the fit.", "frames", 3, 1000),
         Parameter("visibility", bool, True, "Let parts of the head cover each other; off, nothing bounces either."),
         Parameter("bounce", bool, True, "Count light that bounces between parts of the head."),
         Parameter("specular", bool, True, "Model specular reflection."),
-        Parameter("roughness", float, 0.45, "Roughness to start from.", "", 0.25, 0.7),
+        Parameter("roughness", float, 0.45, "Roughness to start from.", "", 0.1, 0.7),
         Parameter("search_roughness", bool, True, "Search the roughness; else it stays at its start."),
         Parameter("specular_prior", float, 0.7, "Expected specular intensity of skin.", "", 0.01, 2.0),
         Parameter("white_light", float, 0.15, "Expected deviation of the light's log colour ratios from grey.", "",

@@ -98,14 +98,19 @@ def test_robust_weights():
     model = colours + np.array([[0.0], [0.02 * 2.5], [5.0], [-0.2]], np.float32)
     limits = np.zeros((4, 3), np.int8)
     samples = TexelSamples(np.arange(4), colours, np.ones(4), limits)
-    weight = robust_weight(model, samples, NOISE)
+    known = np.full(4, 1e9)
+    weight = robust_weight(model, samples, NOISE, known)
     assert np.allclose(weight[0], 1.0) and np.allclose(weight[1], 0.5) and (weight[2] < 1e-4).all()
     limits[2], limits[3] = 1, 1
-    weight = robust_weight(model, samples, NOISE)
+    weight = robust_weight(model, samples, NOISE, known)
     assert (weight[2] == 0).all(), "a clipped sample is satisfied by any brighter model"
     assert (weight[3] > 0).all(), "and still pulls a darker one up"
     limits[3] = -1
-    assert (robust_weight(model, samples, NOISE)[3] == 0).all()
+    assert (robust_weight(model, samples, NOISE, known)[3] == 0).all()
+    limits[:] = 0
+    guessed = robust_weight(model, samples, NOISE, np.zeros(4))
+    told = robust_weight(model, samples, NOISE, known)
+    assert (guessed[3] > 3.0 * told[3]).all(), "a model that knows nothing does not overrule a sample"
 
 
 def test_fill_is_harmonic():

@@ -42,7 +42,7 @@ class Settings:
 
     light_model: str = "cubemap"
     resolutions: tuple[int, ...] = (8, 16)
-    steps: int = 8
+    steps: int = 20
     independent: float = 5000.0
     noise: tuple[float, float] = (0.006, 0.03)
     priors: LightPriors = field(default_factory=LightPriors)

@@ -11,12 +11,17 @@ import torch
 from shared.solve.appearance import AppearanceSolver, Capture, Settings, State
 from shared.solve.light_step import LightStep
 
-ROUGHNESS_RANGE = (0.25, 0.7)
+ROUGHNESS_RANGE = (0.1, 0.7)
 SHAPING_STEPS = 3
-ROUGHNESS_STEPS = (2, 3)
 _ROUGHNESS_FACTOR = 1.18
-_WORTHWHILE = 0.003
-"""A step that lowers the held-out residual by less than this fraction is the last of its resolution."""
+_WORTHWHILE, _WORTHWHILE_COARSE = 0.003, 0.03
+"""A step that lowers the held-out residual by less than this fraction is the last of its resolution; the first of
+several resolutions is left earlier, since what it cannot resolve keeps its residual high."""
+
+_SETTLED = 0.06
+"""Roughness is searched once steps lower the residual by less than this: under a light that still takes shape, blur
+of the light would pass for roughness. At most as often per resolution as ROUGHNESS_SEARCHES says, first and later."""
+ROUGHNESS_SEARCHES = (2, 1)
 
 
 @dataclass(frozen=True)
@@ -34,15 +39,17 @@ def fit_appearance(
 ) -> Solution:
     """Fits light, albedo, specular intensity and roughness; report receives each step's record.
 
-    The first steps only give the light its shape; highlights, which then begin to say something about scale and
-    roughness, take part from the fourth. Only states after that, of the light model asked for, can win.
+    The first steps only give the light its shape; highlights, which then begin to say something about the scale,
+    take part from the fourth. Only states after that, of the light model asked for, can win.
     """
     solver = AppearanceSolver(capture, settings)
     judges = not capture.fitted.all()  # a clip too short to hold frames out is judged by the fitted ones
-    records, best = [], None
-    for stage, (model, resolution) in enumerate(settings.light_schedule):
+    records, best, schedule = [], None, settings.light_schedule
+    for stage, (model, resolution) in enumerate(schedule):
         solver.set_light((model, resolution))
-        last, least = np.inf, SHAPING_STEPS + 2 if stage == 0 else 1
+        last, searches = np.inf, 0
+        worthwhile = _WORTHWHILE if stage == len(schedule) - 1 else _WORTHWHILE_COARSE
+        least = SHAPING_STEPS + 2 if stage == 0 else 1
         for number in range(settings.steps):
             shaping = stage == 0 and number < min(SHAPING_STEPS, settings.steps - 1)
             record = _step(solver, settings, shaping) | {"light": model, "resolution": resolution, "step": number}
@@ -51,12 +58,14 @@ def fit_appearance(
             judged = record["held_out" if judges else "fitted"]
             if not shaping and model == settings.light_model and (best is None or judged < best[0]):
                 best = (judged, record, _copy(solver.state))
-            if not shaping and number >= least and judged > last * (1.0 - _WORTHWHILE):
+            settled = judged > last * (1.0 - _SETTLED)
+            wanted = settings.specular and settings.search_roughness and number + 1 < settings.steps
+            if wanted and settled and searches < ROUGHNESS_SEARCHES[min(stage, 1)]:
+                solver.state.roughness, solver.lobes = search_roughness(solver), None
+                searches += 1
+            elif not shaping and number >= least and judged > last * (1.0 - worthwhile):
                 break
-            last = judged if not shaping else np.inf
-            if settings.specular and settings.search_roughness and stage == 0 and number in ROUGHNESS_STEPS:
-                solver.state.roughness = search_roughness(solver)
-                solver.lobes = None
+            last = judged
     return Solution(best[2], tuple(records), best[1]["fitted"], best[1]["held_out"])
 
 

@@ -24,7 +24,7 @@ from shared.solve.capture import (
     spread_frames,
 )
 from shared.solve.fit_appearance import Solution, fit_appearance
-from shared.solve.texture import TexelMaterial
+from shared.solve.texture import PRIOR_SPREAD, TexelMaterial
 from shared.solve.texture_pass import Clip, TexturePass
 from shared.texels import TexelSurface
 from shared.transfer import mesh_points
@@ -32,9 +32,6 @@ from shared.transfer import mesh_points
 FACE_SKIN = ("forehead", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "chin", "jaw")
 """Segments whose skin the light is solved from; hair, brows, lips, lids, eyes and what
 clothes may cover are left out."""
-
-PRIOR_SPREAD = 0.3
-"""Standard deviation of a texel's log albedo if all one knew were the person's mean: confidence compares with it."""
 
 
 class InverseInputs(Protocol):

@@ -19,7 +19,9 @@ import torch
 from shared.solve.appearance import AppearanceSolver
 from shared.solve.scale import settle_scale
 
-_LARGEST_STEP = 1.5
+_LARGEST_RISE, _LARGEST_FALL = 1.5, 4.0
+"""Bounds on a step of the log light, each texel by itself: the linearisation of exp holds for a rise of this size; a
+texel that wants to go dark may fall further, and must not slow the others down."""
 
 
 def conjugate_gradients(
@@ -148,8 +150,7 @@ class LightStep:
 
         right = -level_transposed(self.gradient())
         solved = conjugate_gradients(lambda x: level_transposed(self.product(level(x))), right, products)
-        step = level(solved)
-        step *= min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-9))
+        step = level(np.clip(level(solved), -_LARGEST_FALL, _LARGEST_RISE))
         self.before = self.cost(state.params)
         for _ in range(6):
             if self.cost(state.params + step) < self.before:

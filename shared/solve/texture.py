@@ -14,12 +14,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.ndimage import gaussian_filter
 
 from shared.texels import TexelSamples, TexelSurface
 
 CORRELATED_FRAMES = 6.0
 """Errors of neighbouring frames are alike: so many frames count as one independent observation."""
+
+PRIOR_SPREAD = 0.3
+"""Standard deviation of a texel's log albedo if all one knew were the person's mean."""
 
 POOL = 1.0
 """Texels of a neighbourhood that count as independent for the specular intensity: errors of shape and light are as
@@ -49,21 +53,22 @@ class TexelMaterial:
 
 
 class NormalEquations:
-    """Sums over frames per texel and channel of weighted products of E, S and the colour I."""
+    """Sums over frames per texel and channel of weighted products of E, S and the colour I.
+
+    sums [T, 15]: EE, ES, EI, SS and SI side by side, three channels each, so that a frame is added in one go.
+    """
 
     def __init__(self, texels: int, noise: Noise):
-        self.noise = noise
-        self.ee, self.es, self.ei, self.ss, self.si = (np.zeros((texels, 3), np.float32) for _ in range(5))
+        self.noise, self.sums = noise, np.zeros((texels, 15), np.float32)
+        self.ee, self.es, self.ei, self.ss, self.si = (self.sums[:, 3 * k : 3 * k + 3] for k in range(5))
 
     def add(self, samples: TexelSamples, irradiance: np.ndarray, reflection: np.ndarray, robust: np.ndarray) -> None:
         """irradiance, reflection, robust [n, 3] at samples.rows; robust: extra weight per channel."""
         weight = samples.weight[:, None] * self.noise.precision(samples.colours) * robust
-        rows, we, ws = samples.rows, weight * irradiance, weight * reflection
-        self.ee[rows] += we * irradiance
-        self.es[rows] += we * reflection
-        self.ei[rows] += we * samples.colours
-        self.ss[rows] += ws * reflection
-        self.si[rows] += ws * samples.colours
+        we, ws = weight * irradiance, weight * reflection
+        share = [we * irradiance, we * reflection, we * samples.colours, ws * reflection, ws * samples.colours]
+        rows, share = torch.from_numpy(samples.rows), torch.from_numpy(np.concatenate(share, axis=1, dtype=np.float32))
+        torch.from_numpy(self.sums).index_add_(0, rows, share)
 
     def solve_albedo(self, specular: np.ndarray, fallback: np.ndarray, pull: float) -> np.ndarray:
         """Albedo [T, 3] for given specular [T]; fallback [T, 3] acts with precision pull."""
@@ -84,11 +89,17 @@ class NormalEquations:
         return self.ee * albedo**2 / CORRELATED_FRAMES
 
 
-def robust_weight(model: np.ndarray, samples: TexelSamples, noise: Noise, scale: float = 2.5) -> np.ndarray:
-    """Cauchy weight [n, 3] of each sample given the model [n, 3]; 0 where a clipped or crushed sample is satisfied."""
+def robust_weight(
+    model: np.ndarray, samples: TexelSamples, noise: Noise, information: np.ndarray, scale: float = 2.5
+) -> np.ndarray:
+    """Cauchy weight [n, 3] of each sample given the model [n, 3]; 0 where a clipped or crushed sample is satisfied.
+
+    information [n]: precision of the model's log albedo; what it leaves open is no reason to distrust a sample.
+    """
     error = model - samples.colours
     satisfied = ((samples.limits > 0) & (error >= 0)) | ((samples.limits < 0) & (error <= 0))
-    return np.where(satisfied, 0.0, 1.0 / (1.0 + error**2 * noise.precision(samples.colours) / scale**2))
+    variance = 1.0 / noise.precision(samples.colours) + model**2 / (information[:, None] + PRIOR_SPREAD**-2)
+    return np.where(satisfied, 0.0, 1.0 / (1.0 + error**2 / (scale**2 * variance))).astype(np.float32)
 
 
 def pooled_specular(

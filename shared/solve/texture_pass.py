@@ -1,4 +1,4 @@
-"""Runs the frames through the texture's normal equations: two passes to fit, one over held-out frames to choose."""
+"""The frames through the texture's normal equations: some for a first look, all to fit, held-out ones to choose."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from shared.gather import Picture, SurfaceViewer
 from shared.shading import VertexShading
+from shared.solve.capture import spread_frames
 from shared.solve.texture import (
     Noise,
     NormalEquations,
@@ -19,6 +20,8 @@ from shared.solve.texture import (
 from shared.texels import TexelSamples, TexelSurface, harmonic_fill
 
 _ALBEDO_PULL = 10.0
+FIRST_PASS_FRAMES = 32
+"""Enough to tell what a texel looks like, so that every frame's samples can be weighed by it."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +61,10 @@ class TexturePass:
         """Both passes -> the material, and a record of what the held-out frames said to each pooling width."""
         count = len(self.surface)
         mean = np.full(count, self.specular, np.float32)
-        equations = self._accumulate(None, "texture, first pass")
-        first = self._close(equations, mean)
-        equations = self._accumulate(first, "texture, second pass")
+        fitted = np.nonzero(self.clip.fitted)[0]
+        some = fitted[spread_frames(len(fitted), FIRST_PASS_FRAMES)]
+        first = self._close(self._accumulate(None, some, "texture, first pass"), mean)
+        equations = self._accumulate(first, fitted, "texture, second pass")
         candidates = [
             self._close(equations, pooled_specular(self.surface, equations, width, self.specular, self.sigma))
             for width in widths
@@ -71,14 +75,15 @@ class TexturePass:
         record = {"held_out": dict(zip(names, errors, strict=True)), "chosen": names[best]}
         return candidates[best], record
 
-    def _accumulate(self, material: TexelMaterial | None, label: str) -> NormalEquations:
+    def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> NormalEquations:
         equations = NormalEquations(len(self.surface), self.noise)
-        for f in self.progress(np.nonzero(self.clip.fitted)[0], label):
+        for f in self.progress(frames, label):
             samples, irradiance, reflection = self.frame(f)
             if material is None:
                 robust = (samples.limits == 0).astype(np.float32)
             else:
-                robust = robust_weight(_model(material, samples, irradiance, reflection), samples, self.noise)
+                model = _model(material, samples, irradiance, reflection)
+                robust = robust_weight(model, samples, self.noise, material.information[samples.rows])
             equations.add(samples, irradiance, reflection, robust)
         return equations
 
@@ -87,9 +92,8 @@ class TexturePass:
         clip = self.clip
         pose, picture = clip.camera_from_head[f], clip.picture(f)
         view = self.viewer.view(pose, clip.intrinsics, picture.inside.shape[::-1])
-        samples = self.surface.samples(view, picture, pose, clip.intrinsics)
         both = np.concatenate([self.shading.irradiance(f), self.shading.reflection(f)], axis=1)
-        both = self.surface.interpolate(both, samples.rows)
+        samples, both = self.surface.samples(view, picture, clip.intrinsics, both)
         return samples, both[:, :3], both[:, 3:]
 
     def _close(self, equations: NormalEquations, specular: np.ndarray) -> TexelMaterial:
