@@ -1,8 +1,11 @@
 """Irradiance and reflection at a mesh's vertices in every frame, for the texture pass and for re-rendering.
 
-Vertices that no frame faces are left out. Irradiance (with bounces) of all frames is one product, kept as half floats
-(6 bytes per vertex and frame); lobe sums depend on the camera and are made for
-key frames, a few degrees of turn apart.
+Vertices that no frame faces are left out; they, and those deep in a cavity, take what the nearest shaded vertex has. A
+fitted head is accurate to some tenths of a millimetre at best: between its lips or inside a nostril, where nearly all
+of the sky is covered, its own visibility says nothing, and would turn a closed mouth into a black slit.
+
+Irradiance (with bounces) of all frames is one product, kept as half floats (6 bytes per vertex and frame); lobe sums
+depend on the camera and are made for key frames, a few degrees of turn apart.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from shared.brdf import hemispherical_albedo
 from shared.envmap import cube_lookup
@@ -20,6 +24,9 @@ from shared.transfer import Points, Transfer, irradiance, node_radiosity
 
 KEY_STEP = 0.05
 """Radians between frames whose lobe sums are computed (3 degrees)."""
+
+DEEP = 0.9
+"""Cosine-weighted share of the hemisphere that the head itself covers, from which on a point counts as in a cavity."""
 
 
 @dataclass(frozen=True)
@@ -38,15 +45,15 @@ class Material:
 class VertexShading:
     """E and S of V vertices under one cubemap light in F frames.
 
-    index [P]: the vertices that are shaded, out of count; points, transfer [P]: theirs; node_transfer: the nodes';
-    light [6 n^2, 3]; directions [J, 3]; camera_from_head [F, 4, 4]; moves: "head" or "camera"; bounce: count light
-    that bounced; key_step: largest turn between two frames whose reflections are computed, radians.
+    index [P]: the vertices that are shaded, out of all, vertices [V, 3]; points, transfer [P]: theirs; node_transfer:
+    the nodes'; light [6 n^2, 3]; directions [J, 3]; camera_from_head [F, 4, 4]; moves: "head" or "camera"; bounce:
+    count light that bounced; key_step: largest turn between two frames whose reflections are computed, radians.
     """
 
     def __init__(
         self,
         index: np.ndarray,
-        count: int,
+        vertices: np.ndarray,
         points: Points,
         transfer: Transfer,
         node_transfer: Transfer,
@@ -58,7 +65,7 @@ class VertexShading:
         bounce: bool = True,
         key_step: float = KEY_STEP,
     ):
-        self.index, self.count, self.material, self.directions = index, count, material, directions
+        self.material, self.directions = material, directions
         self.points, self.transfer = points, transfer
         self.light_along = light_along(light, directions, world_from_head(camera_from_head, moves))
         flat = self.light_along.reshape(len(directions), -1)
@@ -73,12 +80,15 @@ class VertexShading:
         self._turn = turned_so_far(camera_from_head)
         self._keys = key_frames(self._turn, key_step)
         self._key_reflection: dict[int, np.ndarray] = {}
+        self._stand_in = _stand_ins(vertices, index, transfer.blocked)
 
     def irradiance(self, frame: int) -> np.ndarray:
-        """E [V, 3] float32 over pi, zero at vertices that are not shaded."""
-        result = np.zeros((self.count, 3), np.float32)
-        result[self.index] = self._irradiance[:, frame]
-        return result
+        """E [V, 3] float32 over pi."""
+        return self._irradiance[:, frame].astype(np.float32)[self._stand_in]
+
+    def mean_irradiance(self) -> np.ndarray:
+        """[V, 3] float32: E averaged over the frames."""
+        return self._irradiance.mean(1, dtype=np.float32)[self._stand_in]
 
     def reflection(self, frame: int) -> np.ndarray:
         """S [V, 3] float32 at specular_intensity 1, between the two key frames around this one.
@@ -92,9 +102,7 @@ class VertexShading:
         value = self._at_key(low).astype(np.float32)
         if high != low:
             value += np.float32(share) * (self._at_key(high).astype(np.float32) - value)
-        result = np.zeros((self.count, 3), np.float32)
-        result[self.index] = value
-        return result
+        return value[self._stand_in]
 
     def _at_key(self, frame: int) -> np.ndarray:
         """S of the shaded vertices in one frame [P, 3], half floats; made once."""
@@ -112,6 +120,16 @@ class VertexShading:
             )
             self._key_reflection[frame] = value
         return self._key_reflection[frame]
+
+
+def _stand_ins(vertices: np.ndarray, index: np.ndarray, blocked: np.ndarray) -> np.ndarray:
+    """[V]: for each vertex the place in index of the nearest shaded vertex in the open, its own where it is one."""
+    trusted = np.nonzero(blocked < DEEP)[0]
+    if len(trusted) == 0:
+        trusted = np.arange(len(index))
+    result = trusted[cKDTree(vertices[index[trusted]]).query(vertices)[1]]
+    result[index[trusted]] = trusted
+    return result
 
 
 def turned_so_far(camera_from_head: np.ndarray) -> np.ndarray:

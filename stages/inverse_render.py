@@ -49,7 +49,8 @@ STAGE = Stage(
         Parameter("specular", bool, True, "Model specular reflection."),
         Parameter("roughness", float, 0.45, "Roughness to start from.", "", 0.1, 0.7),
         Parameter("search_roughness", bool, True, "Search the roughness; else it stays at its start."),
-        Parameter("specular_prior", float, 0.7, "Expected specular intensity of skin.", "", 0.01, 2.0),
+        Parameter("specular_prior", float, 0.7, "Expected specular intensity of skin; index of refraction 1.4: 0.7.",
+                  "", 0.01, 2.0),
         Parameter("white_light", float, 0.15, "Expected deviation of the light's log colour ratios from grey.", "",
                   0.01, 2.0),
         Parameter("light_smoothness", float, 1.0, "Weight of the light's smoothness.", "", 0.0, 1000.0),
@@ -61,6 +62,8 @@ STAGE = Stage(
 )
 
 LATLONG_HEIGHT = 128
+SPECULAR_SPREAD = 0.25
+"""Standard deviation of the logarithm of people's mean specular intensity about the expected one."""
 FLAT_NORMALS = "flat: this version solves no fine normals"
 
 
@@ -84,7 +87,7 @@ def read_settings(job: Job):
         specular=params.specular,
         roughness=params.roughness,
         search_roughness=params.search_roughness,
-        specular_prior=(params.specular_prior, 0.5 * params.specular_prior),
+        specular_prior=(params.specular_prior, SPECULAR_SPREAD),
     )
     return InverseSettings(
         sizes=Sizes(params.points, params.directions, params.bounce_nodes),

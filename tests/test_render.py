@@ -31,7 +31,7 @@ def ball():
     poses = rigid(rotation, np.array([[0.0, 0, DISTANCE], [30.0, -20.0, DISTANCE]]))
     shading = VertexShading(
         np.arange(len(points)),
-        len(points),
+        points.positions,
         points,
         transfer,
         node_transfer,

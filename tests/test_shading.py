@@ -1,5 +1,7 @@
 """Specular lobe sums, the shading of a mesh in all frames, and samples gathered from pictures."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from shapes import grid_plane, sphere
@@ -112,7 +114,7 @@ def shade(mesh, light, poses, moves="head", albedo=0.5, **options):
     material = Material(np.full((len(nodes.points), 3), albedo), 1.0, 0.45)
     index = np.arange(len(points))
     shading = VertexShading(
-        index, len(points), points, transfer, node_transfer, material, light, DIRECTIONS, poses, moves, **options
+        index, points.positions, points, transfer, node_transfer, material, light, DIRECTIONS, poses, moves, **options
     )
     return shading, points
 
@@ -151,19 +153,25 @@ def test_reflections_between_key_frames_are_interpolated():
         assert np.abs(coarse.reflection(f) - every.reflection(f))[front].max() < 0.02 * every.reflection(f).max()
 
 
-def test_unshaded_vertices_are_black():
+def test_vertices_without_shading_take_the_nearest():
+    """A ball of which three vertices are shaded, then one of these said to lie deep in a cavity."""
     ball = sphere(80.0, 2)
     scene, nodes = RayScene(ball.vertices, ball.faces), bounce_nodes(ball, 20)
     index = np.array([4, 10, 11])
     points = mesh_points(ball, index)
     transfer, node_transfer = (trace_transfer(scene, some, nodes, DIRECTIONS) for some in (points, nodes.points))
     material = Material(np.full((len(nodes.points), 3), 0.3), 0.5, 0.4)
-    light, count = np.ones((24, 3)), len(ball.vertices)
-    shading = VertexShading(
-        index, count, points, transfer, node_transfer, material, light, DIRECTIONS, nods(np.zeros(1)), "head"
-    )
-    assert np.array_equal(np.nonzero(shading.irradiance(0)[:, 0])[0], index)
-    assert shading.reflection(0).shape == (count, 3)
+    light = np.repeat(lamp(cube_directions(8)), 3, axis=1)
+
+    def shaded(transfer):
+        scene_light = (material, light, DIRECTIONS, nods(np.zeros(1)), "head")
+        return VertexShading(index, ball.vertices, points, transfer, node_transfer, *scene_light)
+
+    found = shaded(transfer).irradiance(0)
+    nearest = np.linalg.norm(ball.vertices[:, None] - ball.vertices[index], axis=2).argmin(1)
+    assert np.array_equal(found, found[index[nearest]]) and len(np.unique(found[:, 0])) == 3
+    deep = shaded(replace(transfer, blocked=np.array([0.0, 0.95, 0.0], np.float32))).irradiance(0)
+    assert len(np.unique(deep[:, 0])) == 2 and np.array_equal(deep[index[[0, 2]]], found[index[[0, 2]]])
 
 
 def test_key_frames_are_near_each_other_in_turn():

@@ -15,6 +15,7 @@ from shared.texels import TexelSamples, TexelSurface, harmonic_fill
 from shared.texture import sample_bilinear
 
 NOISE = Noise(0.01, 0.02)
+NEVER_WRONG = np.zeros((10, 3))
 
 
 class FewTexels:
@@ -86,11 +87,14 @@ def test_without_pooling_every_texel_has_the_mean_intensity():
 def test_information_grows_with_frames():
     frames = random_frames(10, frames=8)
     frames[3][:] = 1.0
-    some = accumulated(*(x[:4] for x in frames)).information(np.full(3, 0.9))
-    every = accumulated(*frames).information(np.full(3, 0.9))
+    some = accumulated(*(x[:4] for x in frames)).information(np.full(3, 0.9), NEVER_WRONG)
+    every = accumulated(*frames).information(np.full(3, 0.9), NEVER_WRONG)
     assert (every > some).all()
-    double = accumulated(*(np.concatenate([x, x]) for x in frames)).information(np.full(3, 0.9))
+    double = accumulated(*(np.concatenate([x, x]) for x in frames)).information(np.full(3, 0.9), NEVER_WRONG)
     assert np.allclose(double, 2.0 * every, rtol=1e-5)
+    # Errors that all frames share cannot be averaged away.
+    shared = accumulated(*frames).information(np.full(3, 0.9), NEVER_WRONG + 0.04)
+    assert (shared < 25.0).all() and np.allclose(1.0 / shared, 1.0 / every + 0.04)
 
 
 def test_robust_weights():
@@ -146,6 +150,9 @@ class PlateShading:
         angle = 0.6 * frame
         tilt = self.uvs @ [np.cos(angle), np.sin(angle)]
         return ((0.7 + 0.25 * tilt + 0.2 * np.sin(1.7 * frame))[:, None] * [1.0, 0.95, 0.9]).astype(np.float32)
+
+    def mean_irradiance(self):
+        return np.mean([self.irradiance(frame) for frame in range(FRAMES)], axis=0)
 
     def reflection(self, frame):
         centre = 0.5 + 0.4 * np.array([np.cos(1.1 * frame), np.sin(1.1 * frame)])

@@ -10,6 +10,7 @@ import numpy as np
 from shared.gather import Picture, SurfaceViewer, gather_samples
 from shared.geometry import fibonacci_sphere, world_from_head
 from shared.raycast import RayScene
+from shared.shading import DEEP
 from shared.solve.appearance import Capture
 from shared.transfer import (
     Nodes,
@@ -22,7 +23,6 @@ from shared.transfer import (
 )
 
 MINIMUM_FRAMES = 4
-_DEEP = 0.9
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def build_capture(
     seen = (samples.weight[:, fitted] > 0).sum(1) >= min(MINIMUM_FRAMES, int(fitted.sum()))
     points = mesh_points(viewer.mesh, index[seen])
     transfer = scenery.trace(points, progress)
-    shallow = np.nonzero(transfer.blocked < _DEEP)[0]
+    shallow = np.nonzero(transfer.blocked < DEEP)[0]
     chosen = np.nonzero(seen)[0][shallow]
     return Capture(
         points=points.take(shallow),

@@ -149,7 +149,7 @@ def shade_vertices(
     state = solution.state
     return VertexShading(
         index,
-        len(viewer.mesh.vertices),
+        viewer.mesh.vertices,
         points,
         transfer,
         scenery.node_transfer,

@@ -3,7 +3,7 @@
 Twice the light on half the albedo gives the same diffuse picture. Three statements fix the factor, each a normal
 distribution over logarithms:
 
-- skin's luminance: log Y ~ N(mean, 0.45), from reference skins of all tones;
+- skin's luminance: log Y is normal with the median and the spread of reference skins of all tones;
 - skin's chroma lies on the locus of measured skins: log R/G and log B/G are linear in log Y, sigma as found there;
 - the light on the skin is white after the camera's own white balance: log R/G and log B/G ~ N(0, 0.15).
 
@@ -37,7 +37,8 @@ REFERENCE_SKINS = np.array(
 )
 """Linear Rec.709 reflectance of reference skins, light to dark, then the two chart patches."""
 
-LUMINANCE_SIGMA = 0.45
+LUMINANCE_SIGMA = float(np.std(np.log(REFERENCE_SKINS @ LUMINANCE), ddof=1))
+"""Of the reference skins' log luminance: 0.87. Anything narrower darkens the fair and lightens the dark."""
 WHITE_SIGMA = 0.15
 HIGHLIGHT_SIGMA = 0.08
 MODEL_ERROR = 0.003

@@ -25,6 +25,10 @@ CORRELATED_FRAMES = 6.0
 PRIOR_SPREAD = 0.3
 """Standard deviation of a texel's log albedo if all one knew were the person's mean."""
 
+IRRADIANCE_ERROR = 0.03
+"""Error of the modelled irradiance, relative to the face's mean: bounces, visibility and shape are so good at best.
+In a cavity that gets a tenth of the light it leaves the albedo open by a third."""
+
 POOL = 1.0
 """Texels of a neighbourhood that count as independent for the specular intensity: errors of shape and light are as
 wide as the neighbourhood itself."""
@@ -70,8 +74,8 @@ class NormalEquations:
         rows, share = torch.from_numpy(samples.rows), torch.from_numpy(np.concatenate(share, axis=1, dtype=np.float32))
         torch.from_numpy(self.sums).index_add_(0, rows, share)
 
-    def solve_albedo(self, specular: np.ndarray, fallback: np.ndarray, pull: float) -> np.ndarray:
-        """Albedo [T, 3] for given specular [T]; fallback [T, 3] acts with precision pull."""
+    def solve_albedo(self, specular: np.ndarray, fallback: np.ndarray, pull: float | np.ndarray) -> np.ndarray:
+        """Albedo [T, 3] for given specular [T]; fallback [T, 3] acts with precision pull, a number or [T, 3]."""
         moment = self.ei - specular[:, None] * self.es
         return np.clip((moment + pull * fallback) / (self.ee + pull), 0.002, 1.0).astype(np.float32)
 
@@ -80,13 +84,14 @@ class NormalEquations:
         ratio = self.es / np.maximum(self.ee, 1e-6)
         return np.maximum((self.ss - ratio * self.es).sum(1), 0.0), (self.si - ratio * self.ei).sum(1)
 
-    def information(self, typical_albedo: np.ndarray) -> np.ndarray:
+    def information(self, typical_albedo: np.ndarray, systematic: np.ndarray) -> np.ndarray:
         """[T, 3] precision of the log albedo per channel, with correlated frames taken together.
 
-        Where little light arrives a small error makes a large albedo: typical_albedo [3] bounds what counts.
+        Where little light arrives a small error makes a large albedo: typical_albedo [3] bounds what counts;
+        systematic [T, 3]: variance that all frames share.
         """
         albedo = np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)
-        return self.ee * albedo**2 / CORRELATED_FRAMES
+        return 1.0 / (systematic + CORRELATED_FRAMES / np.maximum(self.ee * albedo**2, 1e-9))
 
 
 def robust_weight(

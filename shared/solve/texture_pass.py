@@ -11,6 +11,8 @@ from shared.gather import Picture, SurfaceViewer
 from shared.shading import VertexShading
 from shared.solve.capture import spread_frames
 from shared.solve.texture import (
+    IRRADIANCE_ERROR,
+    PRIOR_SPREAD,
     Noise,
     NormalEquations,
     TexelMaterial,
@@ -55,6 +57,8 @@ class TexturePass:
     ):
         self.surface, self.viewer, self.shading, self.clip = surface, viewer, shading, clip
         self.typical_albedo = typical_albedo
+        mean = surface.interpolate(shading.mean_irradiance())
+        self.systematic = np.square(IRRADIANCE_ERROR * np.median(mean, axis=0) / np.maximum(mean, 1e-6))
         self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), progress
 
     def run(self, widths: tuple[float, ...]) -> tuple[TexelMaterial, dict]:
@@ -98,7 +102,7 @@ class TexturePass:
 
     def _close(self, equations: NormalEquations, specular: np.ndarray) -> TexelMaterial:
         """Albedo for given intensities; channels left open by the samples follow the others and the neighbourhood."""
-        information = equations.information(self.typical_albedo)
+        information = equations.information(self.typical_albedo, self.systematic)
         rough = equations.solve_albedo(specular, np.zeros_like(equations.ee), 1e-6)
         certain = information / (1.0 + information)
         known, total = self.surface.to_vertices(rough, certain)
@@ -106,7 +110,9 @@ class TexturePass:
         smooth = np.maximum(self.surface.interpolate(smooth.astype(np.float32)), 1e-3)
         # A texel's brightness by its certain channels, its colour otherwise the neighbourhood's.
         brighter = (certain * np.log(np.maximum(rough, 1e-3) / smooth)).sum(1) / (certain.sum(1) + 0.3)
-        albedo = equations.solve_albedo(specular, smooth * np.exp(brighter)[:, None], _ALBEDO_PULL)
+        brighter *= (PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + self.systematic)).mean(1)
+        pull = _ALBEDO_PULL + equations.ee * (self.systematic / PRIOR_SPREAD**2)
+        albedo = equations.solve_albedo(specular, smooth * np.exp(brighter)[:, None], pull)
         return TexelMaterial(albedo, specular, information.min(1))
 
     def held_out_errors(self, candidates: list[TexelMaterial]) -> list[float]:

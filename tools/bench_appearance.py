@@ -1,0 +1,256 @@
+"""Measures inverse_render on a subject whose truth is known: accuracy by case, and cost over sizes.
+
+    python -m tools.bench_appearance SUBJECT RUN [--tracked] [--cases full no_bounce ...] [--set key=value] [--out DIR]
+    python -m tools.bench_appearance SUBJECT RUN --cost
+        times over 4 numbers of frames and 4 sizes of the maps, with the crops enlarged to 1K and frames repeated
+
+SUBJECT: a folder with gt/; RUN: a run's folder whose work/ holds sample_frames and track_landmarks. True mesh and poses
+are used unless --tracked. Each case solves the clip anew with some models switched off, and is compared with the truth:
+albedo (dE2000 after one gain per channel, and raw), specular intensity and roughness where confidence is over one half,
+light through a 25 degree lobe, and re-renders against the video on the face skin, on fitted and on held-out frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from shared.color import decode_transfer, delta_e_2000, encode_srgb
+from shared.contract.job import Parameters
+from shared.envmap import latlong_from_cube
+from shared.gather import Picture, prepare_picture
+from shared.io.arrays import load_arrays
+from shared.io.clip_inputs import ClipInputs, read_inputs
+from shared.io.images import read_exr, read_png
+from shared.io.meshes import read_obj
+from shared.mesh import interpolate
+from shared.raycast import RayScene, camera_hits
+from shared.render import SurfaceMaps, render_frame
+from shared.solve.inverse import InverseResult, solve_clip
+from shared.texture import sample_bilinear
+from stages.inverse_render import STAGE, read_settings
+from tools import score_measures
+from tools.score_buffers import SurfaceViewer as BufferViewer
+
+CASES: dict[str, dict] = {
+    "full": {},
+    "no_visibility": {"visibility": False},
+    "no_bounce": {"bounce": False},
+    "no_specular": {"specular": False},
+    "harmonics_2": {"light_model": "harmonics_2"},
+    "harmonics_4": {"light_model": "harmonics_4"},
+    "sun_sky": {"light_model": "sun_sky"},
+}
+CONFIDENT = 0.5
+RENDERED_FRAMES = 6
+COST_FRAMES, COST_MAPS, LARGE_CROP = (60, 120, 250, 500), (256, 512, 1024, 2048), 1024
+
+
+def silent(items: Iterable, label: str = "", total: int | None = None) -> Iterable:
+    """Progress that shows nothing."""
+    return items
+
+
+def settings_of(changes: dict):
+    """The stage's defaults with some parameters changed -> the solver's settings. InputError for unknown ones."""
+
+    class _Job:
+        params = Parameters({**STAGE.defaults(), **STAGE.parse(changes, "tools.bench_appearance")})
+
+    return read_settings(_Job())
+
+
+def open_clip(subject: Path, run: Path, tracked: bool) -> tuple[ClipInputs, np.ndarray]:
+    """Inputs and the frames' numbers in the source."""
+    truth = ("", "") if tracked else (str(subject / "gt" / "mesh.obj"), str(subject / "gt" / "poses.npz"))
+    inputs, _, index = read_inputs(run / "work" / "sample_frames", run / "work" / "track_landmarks", *truth)
+    return inputs, index
+
+
+def crop_of(buffer: np.ndarray, inputs: ClipInputs) -> np.ndarray:
+    """A buffer of the full source frame cut and scaled to the crop that the clip was solved in."""
+    x, y, scale = inputs.frames.crop
+    matrix = np.array([[scale, 0.0, -x * scale + 0.5 * (scale - 1)], [0.0, scale, -y * scale + 0.5 * (scale - 1)]])
+    return cv2.warpAffine(buffer.astype(np.float32), matrix, inputs.size, flags=cv2.INTER_LINEAR)
+
+
+def map_errors(subject: Path, inputs: ClipInputs, index: np.ndarray, maps: dict[str, np.ndarray]) -> dict:
+    """Albedo, specular intensity, roughness and the calibration of the confidence, in the frames that hold truth."""
+    viewer, pairs = BufferViewer(inputs.mesh, maps), {name: [] for name in ("albedo", "specular", "roughness")}
+    fields = {"albedo": "diffuse_albedo", "specular": "specular_intensity", "roughness": "roughness"}
+    confidence = []
+    place = {int(frame): i for i, frame in enumerate(index)}
+    for frame in load_arrays(subject / "gt" / "poses.npz")["gt_frames"]:
+        stem = subject / "gt" / "frames" / f"{int(frame):04d}"
+        if int(frame) not in place:
+            continue
+        inside = read_png(Path(f"{stem}_mask.png")) > 127
+        row, column = np.nonzero(inside)
+        intrinsics = inputs.frames.intrinsics_source
+        seen = viewer.view(inputs.camera_from_head[place[int(frame)]], intrinsics, np.stack([column, row], 1))
+        hit = seen["coverage"] > 0.5
+        confidence.append(seen["confidence"][hit].ravel())
+        for name, field in fields.items():
+            found = seen[field][hit].reshape(hit.sum(), -1)
+            truth = read_exr(f"{stem}_{name}.exr")[row[hit], column[hit]].reshape(hit.sum(), -1)
+            pairs[name].append((truth[:, : found.shape[1]], found))
+    joined = {name: tuple(np.concatenate(side) for side in zip(*both, strict=True)) for name, both in pairs.items()}
+    trusted = np.concatenate(confidence) > CONFIDENT
+    result = _albedo_errors(*joined["albedo"], np.concatenate(confidence))
+    result["confident_share"] = float(trusted.mean())
+    for name in ("specular", "roughness"):
+        truth, found = (side[trusted, 0] for side in joined[name])
+        errors = score_measures.scalar_errors(truth, found)
+        result |= {f"{name}_{key}": errors[key] for key in ("rmse", "correlation", "mean_gt", "mean_result")}
+    return result
+
+
+def _albedo_errors(truth: np.ndarray, found: np.ndarray, confidence: np.ndarray) -> dict:
+    gain = score_measures.channel_gain(truth.astype(np.float64), found)
+    aligned = delta_e_2000(np.clip(truth, 0, None), np.clip(found * gain, 0, None))
+    raw = delta_e_2000(np.clip(truth, 0, None), np.clip(found, 0, None))
+    edges = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 0.97, 1.001])
+    bins = [(confidence >= low) & (confidence < high) for low, high in zip(edges[:-1], edges[1:], strict=True)]
+    calibration = [
+        [float(low), int(inside.sum()), float(np.median(aligned[inside])) if inside.any() else None]
+        for low, inside in zip(edges[:-1], bins, strict=True)
+    ]
+    return {
+        "delta_e2000_median": float(np.median(aligned)),
+        "delta_e2000_p90": float(np.percentile(aligned, 90)),
+        "delta_e2000_raw_median": float(np.median(raw)),
+        "psnr_linear": score_measures.psnr(truth, found * gain),
+        "gain": [round(float(value), 4) for value in gain],
+        "calibration": calibration,
+    }
+
+
+def light_errors(subject: Path, latlong: np.ndarray) -> dict:
+    """Correlation and relative error of the light through a lobe of 25 degrees, everywhere and in front."""
+    size = (score_measures.ENVMAP_WIDTH, score_measures.ENVMAP_WIDTH // 2)
+    truth = cv2.resize(read_exr(subject / "gt" / "envmap.exr"), size, interpolation=cv2.INTER_AREA)
+    errors = score_measures.envmap_errors(truth, cv2.resize(latlong, size, interpolation=cv2.INTER_AREA))
+    return {name: errors[name] for name in ("lobe25_correlation", "lobe25_rel_rmse", "lobe25_front_correlation")}
+
+
+def render_errors(subject: Path, inputs: ClipInputs, result: InverseResult) -> dict:
+    """sRGB-coded PSNR of re-renders against the video's own frames on the face skin, fitted and held out."""
+    truth_mesh, mask = read_obj(subject / "gt" / "mesh.obj"), read_exr(subject / "gt" / "mask.exr")
+    poses = load_arrays(subject / "gt" / "poses.npz")["camera_from_head"]
+    scene = RayScene(truth_mesh.vertices, truth_mesh.faces)
+    maps = SurfaceMaps(*(result.maps[name] for name in ("diffuse_albedo", "specular_intensity")))
+    errors: dict[str, list] = {"fitted": [], "held_out": []}
+    for name, chosen in (("fitted", result.fitted), ("held_out", ~result.fitted)):
+        index = np.nonzero(chosen)[0]
+        for f in index[np.unique(np.linspace(0, len(index) - 1, RENDERED_FRAMES).astype(int))]:
+            frame, pose = int(inputs.frames.frame_index[inputs.place[f]]), inputs.camera_from_head[f]
+            face, bary, _ = camera_hits(scene, poses[frame], inputs.intrinsics, *inputs.size)
+            hit = face >= 0
+            uv = interpolate(truth_mesh.uvs, truth_mesh.face_uvs, face[hit], bary[hit])
+            skin = np.zeros(face.shape, bool)
+            skin[hit] = sample_bilinear(mask, uv).reshape(len(uv), -1)[:, 0] > 0.5
+            skin = cv2.erode(skin.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+            image, coverage = render_frame(
+                result.viewer, result.shading, maps, f, pose, inputs.intrinsics, inputs.size
+            )
+            seen = skin & (coverage > 0.99)
+            video = inputs.picture(f).levels[0]
+            difference = encode_srgb(np.clip(video[seen], 0, 1)) - encode_srgb(np.clip(image[seen], 0, 1))
+            errors[name].append((float(np.square(difference).sum()), difference.size))
+    mean = {name: np.sum(parts, 0) for name, parts in errors.items()}
+    return {f"rerender_{name}": float(-10 * np.log10(total / count)) for name, (total, count) in mean.items()}
+
+
+def measure(subject: Path, inputs: ClipInputs, index: np.ndarray, changes: dict, note: Callable) -> tuple[dict, object]:
+    """Solves one case and compares it with the truth -> scores and the result."""
+    start = time.perf_counter()
+    result = solve_clip(inputs, settings_of(changes), silent, note)
+    scores = {"seconds": time.perf_counter() - start}
+    scores["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    scores |= map_errors(subject, inputs, index, result.maps)
+    scores |= light_errors(subject, latlong_from_cube(result.solution.state.light, 128))
+    return scores | render_errors(subject, inputs, result), result
+
+
+class LargeClip:
+    """A clip's inputs with crops of LARGE_CROP pixels' height and any number of frames, repeated as needed."""
+
+    def __init__(self, inputs: ClipInputs, count: int):
+        self._inputs = inputs
+        # Back and forth, so that the turn stays continuous.
+        forth = np.arange(len(inputs.camera_from_head))
+        self._frame = np.resize(np.concatenate([forth, forth[::-1]]), count)
+        self.factor = LARGE_CROP / inputs.size[1]
+        self.size = (round(inputs.size[0] * self.factor), LARGE_CROP)
+        self.intrinsics = np.diag([self.factor, self.factor, 1.0]) @ inputs.intrinsics
+        self.camera_from_head = inputs.camera_from_head[self._frame]
+        self.mesh, self.moves = inputs.mesh, inputs.moves
+        self.face_segment, self.segment_names = inputs.face_segment, inputs.segment_names
+
+    def picture(self, f: int) -> Picture:
+        """Frame f, enlarged."""
+        frames, i = self._inputs.frames, int(self._inputs.place[self._frame[f]])
+        codes = cv2.resize(frames.read_codes(i), self.size, interpolation=cv2.INTER_LINEAR)
+        mask = cv2.resize(frames.read_mask(i), self.size, interpolation=cv2.INTER_NEAREST)
+        steps = np.iinfo(codes.dtype).max
+        return prepare_picture(codes, decode_transfer(np.arange(steps + 1) / steps, frames.transfer)[codes], mask)
+
+
+def cost_table(inputs: ClipInputs, changes: dict) -> None:
+    """Prints seconds of the light's and of the texture's part, and the peak memory so far, over sizes."""
+    print("frames  map  light_s  texture_s  peak_gb")
+    cases = [(COST_FRAMES[2], size) for size in COST_MAPS] + [(count, COST_MAPS[2]) for count in COST_FRAMES]
+    for count, size in dict.fromkeys(cases):
+        marks: list[tuple[str, float]] = []
+
+        def progress(items, label="", total=None, marks=marks):
+            marks.append((label, time.perf_counter()))
+            return items
+
+        start = time.perf_counter()
+        solve_clip(LargeClip(inputs, count), settings_of({**changes, "map_size": size}), progress, lambda text: None)
+        end, first = time.perf_counter(), dict(marks)["tracing the surface"]
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+        print(f"{count:6d} {size:4d} {first - start:8.1f} {end - first:10.1f} {peak:8.2f}", flush=True)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("subject", type=Path)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--tracked", action="store_true", help="tracked mesh and poses instead of the true ones")
+    parser.add_argument("--cases", nargs="*", default=["full"], choices=CASES)
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="parameters for every case")
+    parser.add_argument("--out", type=Path, help="folder for the maps of each case")
+    parser.add_argument("--cost", action="store_true", help="times over sizes instead of accuracy")
+    options = parser.parse_args(arguments)
+    inputs, index = open_clip(options.subject, options.run, options.tracked)
+    given = dict(setting.split("=", 1) for setting in options.set)
+    if options.cost:
+        cost_table(inputs, given)
+        return 0
+    for case in options.cases:
+        scores, result = measure(options.subject, inputs, index, {**given, **CASES[case]}, print)
+        rounded = {key: round(value, 4) if isinstance(value, float) else value for key, value in scores.items()}
+        print(case, json.dumps(rounded))
+        if options.out:
+            save(options.out / case, inputs, result)
+    return 0
+
+
+def save(folder: Path, inputs: ClipInputs, result: InverseResult) -> None:
+    """Maps as arrays, for looking at."""
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(folder / "maps.npz", light=result.solution.state.light, **result.maps)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
