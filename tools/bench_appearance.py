@@ -37,6 +37,7 @@ from shared.solve.inverse import InverseResult, solve_clip
 from shared.texture import sample_bilinear
 from stages.inverse_render import STAGE, read_settings
 from tools import score_measures
+from tools.bench_relight import relight_errors
 from tools.score_buffers import SurfaceViewer as BufferViewer
 
 CASES: dict[str, dict] = {
@@ -176,6 +177,8 @@ def measure(subject: Path, inputs: ClipInputs, index: np.ndarray, changes: dict,
     scores["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     scores |= map_errors(subject, inputs, index, result.maps)
     scores |= light_errors(subject, latlong_from_cube(result.solution.state.light, 128))
+    relit = relight_errors(subject, result, settings_of(changes), inputs.camera_from_head, index)
+    scores |= {f"relight_{name}": [errors["psnr"], errors["psnr_gain"]] for name, errors in relit.items()}
     return scores | render_errors(subject, inputs, result), result
 
 
