@@ -26,12 +26,15 @@ CRUSHED_CODE, CLIPPED_CODE = 8, 250
 """8-bit code values at and beyond which a pixel says nothing of the skin's texture."""
 
 
-def local_contrast(grey: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Log image minus its local mean over its local spread: [H, W] uint8 -> [H, W] uint8, 128 is the mean."""
+def local_contrast(grey: np.ndarray, sigma_px: float, spread_px: float, floor: float) -> np.ndarray:
+    """Log image minus its local mean over its local spread: [H, W] uint8 -> [H, W] uint8, 128 is the mean.
+
+    sigma_px and spread_px: reach of the mean and of the spread; floor: spread of log radiance below which is noise.
+    """
     log = np.log(grey.astype(np.float32) + 8.0)
     detail = log - cv2.GaussianBlur(log, (0, 0), sigma_px)
-    spread = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), 1.5 * sigma_px)) + 0.02
-    return np.clip(detail / spread * 45.0 + 128.0, 0, 255).astype(np.uint8)
+    spread = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), spread_px)) + floor
+    return np.clip(np.rint(detail / spread * 45.0 + 128.0), 0, 255).astype(np.uint8)
 
 
 def unusable_pixels(rgb: np.ndarray) -> np.ndarray:
@@ -51,7 +54,7 @@ LEAST_SHOWN = 20
 class SurfaceGrid:
     """A reference frame's pixels on a surface: corners [h, w, 3] vertex indices, bary [h, w, 3], valid [h, w] bool.
 
-    scale: grid pixels per image pixel; origin: image position of the grid's first corner, px.
+    scale: grid pixels per image pixel.
     """
 
     reference: int

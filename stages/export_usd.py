@@ -88,7 +88,7 @@ def write_geometry(job: Job, mesh, poses: dict, frames, colour_space: str) -> No
     from shared.io.usdz import write_usdz
 
     write_obj(job.out / "mesh.obj", mesh)
-    intrinsics = frames.intrinsics_source
+    intrinsics = poses["intrinsics"]
     kept = {name: poses[name] for name in ("camera_from_head", "frame_index")}
     save_arrays(job.out / "poses.npz", intrinsics=intrinsics, **kept)
     width, height = frames.source_size

@@ -1,9 +1,11 @@
 """Head pose in each frame and the head's shape.
 
-Reads    sample_frames: the cropped frames and their intrinsics.
-Writes   poses.npz, mesh.npz, landmarks.npz, tracks.npz, tracking.json, overlay.png.
-Method   468 landmarks a frame start the poses; dense skin tracks, adjusted as one rigid body (pycolmap), hold them
-         still; the head model is fitted to the tracks and then bent to them freely. Scale is the head model's prior.
+Reads    sample_frames: the cropped frames and their intrinsics. The subject's own landmarks or poses, where
+         subject.yaml names them.
+Writes   poses.npz, mesh.npz, landmarks.npz, tracks.npz, tracking.json, overlay.png, curves.png, residuals.png.
+Method   468 landmarks a frame start the poses, dense flow and then tracks against the clip's mean texture, adjusted as
+         one rigid body, hold them still; the head model is fitted to the tracks and then bent to them freely. Scale is
+         the head model's prior.
 Fails    no landmarks in three frames; skin that cannot be tracked (too small, blurred, or not the same head).
 """
 
@@ -15,37 +17,46 @@ from shared.contract import Job, Output, Parameter, Stage, main
 
 STAGE = Stage(
     name="track_landmarks",
-    version=1,
+    version=2,
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
+    given=("landmarks", "poses"),
     outputs=(
         Output("poses.npz", "camera_from_head [F, 4, 4], covariance [F, 6, 6], frame_index, intrinsics", unit="mm"),
         Output("mesh.npz", "the fitted head with its UVs and face segments", unit="mm", space="head"),
-        Output("landmarks.npz", "the networks' 468 landmarks of each used frame", unit="px", space="crop"),
+        Output("landmarks.npz", "the 468 landmarks of each used frame", unit="px", space="crop"),
         Output("tracks.npz", "track points on the skin and their reprojection errors", unit="mm", space="head"),
         Output("tracking.json", "residuals, rotation range, excluded frames with their reasons, warnings"),
         Output("overlay.png", "mesh and landmarks drawn over five frames", colour_space="srgb"),
+        Output("curves.png", "pose and its uncertainty over time", colour_space="srgb"),
+        Output("residuals.png", "track errors in the texture's layout", space="uv", colour_space="srgb"),
     ),
     parameters=(
-        Parameter("passes", int, 2, "Passes of dense tracking over the fitted head after the first.", "", 1, 6),
-        Parameter("references", int, 3, "Reference frames that each pass tracks from.", "frames", 1, 5),
-        Parameter("tracks", int, 1500, "Skin points tracked from each reference frame.", "points", 100, 20000),
-        Parameter("warp_width", float, 480.0, "Width of the face in the flow's pictures.", "px", 100.0, 2000.0),
-        Parameter("loss_scale", float, 0.2, "Residual beyond which a track loses its pull.", "px", 0.01, 10.0),
-        Parameter("point_prior", float, 5.0, "Deviation of track points about the fitted head.", "mm", 0.01, 1000.0),
-        Parameter("stiffness", float, 4.0, "Resistance of the free shape correction to bending.", "", 0.01, 1e6),
+        Parameter("start_frames", int, 60, "Frames that the first poses come from.", "frames", 3, 1000),
+        Parameter("references", int, 3, "Reference frames of the dense flow.", "frames", 1, 5),
+        Parameter("flow_tracks", int, 1000, "Skin points that flow follows from each.", "points", 100, 20000),
+        Parameter("warp_width", float, 320.0, "Width of the face in the flow's pictures.", "px", 100.0, 2000.0),
+        Parameter("fine_passes", int, 1, "Passes over the finest detail.", "", 1, 6),
+        Parameter("tracks", int, 2500, "Skin points tracked against the mean texture.", "points", 100, 20000),
+        Parameter("texel", float, 1.0, "Texels of the mean texture.", "px", 0.5, 8.0),
+        Parameter("window", float, 5.0, "Standard width of the windows that are matched.", "texels", 1.5, 30.0),
+        Parameter("point_prior", float, 10.0, "Deviation of track points about the fitted head.", "mm", 0.01, 1000.0),
+        Parameter("fit", str, "robust", "Weights of the head fit.", choices=("robust", "published")),
+        Parameter("stiffness", float, 0.25, "Resistance of the free shape correction to bending.", "", 0.01, 1e6),
         Parameter("least_presence", float, 0.5, "Landmark network's confidence below which a frame is lost.", "", 0, 1),
         Parameter("largest_error", float, 1.5, "Median track error beyond which a frame is excluded.", "px", 0.1, 50.0),
     ),
 )
 
-SMALL_ROTATION_DEG = 15.0
-
 
 def read_landmarks(job: Job, frames) -> tuple[np.ndarray, np.ndarray]:
-    """All frames through the networks -> landmarks [F, 468, 2] px and presence [F]."""
+    """All frames through the networks, or the given file -> landmarks [F, 468, 2] px and presence [F]."""
+    from shared.io.given_tracking import read_given_landmarks
     from shared.io.models import load_face_networks
 
+    if job.subject.landmarks is not None:
+        points, given = read_given_landmarks(job.subject.landmarks, frames.frame_index, frames.crop)
+        return points, given.astype(float)
     networks, previous = load_face_networks(), None
     points, presence = np.zeros((frames.count, 468, 2)), np.zeros(frames.count)
     for i in job.progress(range(frames.count), "landmarks"):
@@ -66,80 +77,97 @@ def eight_bit(codes: np.ndarray) -> np.ndarray:
     return codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8)
 
 
-def build_clip(job: Job, frames, used: np.ndarray, landmarks_px: np.ndarray):
-    """Contrast images and unusable pixels of the frames with a face."""
-    import cv2
+def build_clip(job: Job, frames, used: np.ndarray, landmarks_px: np.ndarray, given_poses: np.ndarray | None):
+    """Contrast pictures and unusable pixels of the frames with a face."""
+    from concurrent.futures import ThreadPoolExecutor
 
-    from shared.solve.track_head import Clip
-    from shared.tracks import local_contrast, unusable_pixels
+    from shared.solve.tracked_clip import TrackedClip, face_width, pictures_of
+    from shared.tracks import THREADS
 
-    clip = Clip([], [], landmarks_px[used], frames.intrinsics, frames.size)
-    sigma = float(np.clip(clip.face_width_px / 55.0, 2.5, 12.0))
-    for i in job.progress(used, "contrast images"):
-        rgb = eight_bit(frames.read_codes(i))
-        clip.contrast.append(local_contrast(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), sigma))
-        background = frames.read_mask(i) == 0
-        clip.unusable.append(unusable_pixels(rgb) | background.astype(np.uint8))
-    return clip
+    width = face_width(landmarks_px[used])
+
+    def pictures(i: int) -> tuple[np.ndarray, ...]:
+        return pictures_of(eight_bit(frames.read_codes(i)), frames.read_mask(i) == 0, width)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        in_order = zip(job.progress(used, "contrast pictures"), pool.map(pictures, used), strict=True)
+        made = [picture for _, picture in in_order]
+    contrast, detail, unusable = (list(kind) for kind in zip(*made, strict=True))
+    return TrackedClip(
+        contrast,
+        detail,
+        unusable,
+        landmarks_px[used],
+        frames.time_s[used],
+        frames.intrinsics,
+        frames.size,
+        None if given_poses is None else given_poses[used],
+        job.subject.hold_poses,
+    )
 
 
-def judge_frames(job: Job, frames, used: np.ndarray, presence: np.ndarray, track) -> tuple[np.ndarray, list[dict]]:
-    """Which of the tracked frames fit [U] bool, and every excluded frame with its reason."""
-    error = np.nanmedian(np.where(np.isfinite(track.error_px), track.error_px, np.nan)[track.reliable], axis=1)
-    limit = max(job.params.largest_error, 4.0 * float(np.median(error)))
-    fits = track.reliable.copy()
-    fits[track.reliable] = error <= limit
+def read_settings(job: Job, focal_known: bool):
+    """The stage's parameters as the solver's settings."""
+    from shared.solve.first_poses import FlowSettings
+    from shared.solve.fit_head import PUBLISHED, FitWeights
+    from shared.solve.track_head import TrackSettings
+
+    params = job.params
+    return TrackSettings(
+        flow=FlowSettings(params.references, params.flow_tracks, params.warp_width),
+        start_frames=params.start_frames,
+        fine_passes=params.fine_passes,
+        tracks=params.tracks,
+        texel_px=params.texel,
+        window_sigma=params.window,
+        prior_mm=params.point_prior,
+        estimate_focal=not focal_known,
+        fit=PUBLISHED if params.fit == "published" else FitWeights(stiffness=params.stiffness),
+    )
+
+
+def excluded_frames(frames, used: np.ndarray, presence: np.ndarray, reasons: list[str]) -> list[dict]:
+    """Every frame that got no pose, with its reason."""
+    of_used = dict(zip(used.tolist(), reasons, strict=True))
     excluded = []
     for i in range(frames.count):
-        place = np.nonzero(used == i)[0]
-        reason = ""
-        if len(place) == 0:
-            reason = f"no face found (presence {presence[i]:.2f})"
-        elif not track.reliable[place[0]]:
-            reason = "too little skin could be tracked"
-        elif not fits[place[0]]:
-            error_px = np.nanmedian(track.error_px[place[0]])
-            reason = f"track error {error_px:.2f} px: blur, talk or a hand before the face"
+        reason = of_used.get(i, f"no face found (presence {presence[i]:.2f})")
         if reason:
             excluded.append({"frame_index": int(frames.frame_index[i]), "reason": reason})
-    return fits, excluded
-
-
-def rotation_range_deg(camera_from_head: np.ndarray) -> float:
-    """Largest angle between two frames' views of the head, in degrees."""
-    from shared.geometry import camera_centres
-    from shared.mesh import normalised
-
-    directions = normalised(camera_centres(camera_from_head))
-    return float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0))))
+    return excluded
 
 
 def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[dict]) -> dict:
     """tracking.json; its warnings also go to the log."""
-    error = track.error_px[fits]
-    turned = rotation_range_deg(track.camera_from_head[fits])
-    warnings = []
-    if turned < SMALL_ROTATION_DEG:
-        warnings.append(
-            f"the view of the head changes by only {turned:.0f} degrees: depth rests on the head model; "
-            "film a turn of 25 degrees to each side"
-        )
-    if not frames.focal_known:
-        warnings.append("the focal length is a guess: depth and scale follow it; give camera.focal_length_mm")
-    if len(excluded) > 0.2 * frames.count:
-        warnings.append(f"{len(excluded)} of {frames.count} frames do not fit and were left out")
+    from shared.solve.judge_track import rotation_range_deg, warnings_of
+
+    lips = track.fit.vertices[np.unique(model.faces[model.segment("lips")])]
+    warnings = warnings_of(track, fits, frames.count, frames.focal_known, lips)
     for warning in warnings:
         job.warn(warning)
+    error = track.error_px[fits]
+    rotation = np.degrees(np.sqrt(np.trace(track.covariance[fits][:, :3, :3], axis1=1, axis2=2)))
     return {
         "segments": list(model.segment_names),
         "excluded": excluded,
         "warnings": warnings,
         "frames": int(fits.sum()),
         "tracks": int(track.error_px.shape[1]),
-        "rotation_range_deg": round(turned, 2),
+        "rotation_range_deg": round(rotation_range_deg(track.camera_from_head[fits]), 2),
+        "rotation_deviation_deg": {
+            "median": round(float(np.median(rotation)), 4),
+            "max": round(float(rotation.max()), 4),
+        },
         "reprojection_px": {
             "median": round(float(np.nanmedian(error)), 4),
             "p95": round(float(np.nanpercentile(error, 95)), 4),
+        },
+        "held_out_px": {"before": round(track.held_out_px[0], 4), "after": round(track.held_out_px[1], 4)},
+        "noise_factor": round(track.noise_factor, 3),
+        "focal": {
+            "solved": track.focal_solved,
+            "gain": round(track.focal_gain, 5),
+            "log_deviation": round(track.focal_deviation, 5),
         },
         "scale": "fixed by the head model's mean size and identity prior",
         "identity": [round(float(code), 4) for code in track.fit.identity],
@@ -149,22 +177,27 @@ def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[d
 
 def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> None:
     """Writes all outputs."""
+    from shared.bundle import zoomed
     from shared.io.arrays import save_arrays, write_json
     from shared.io.images import write_png
     from shared.io.meshes import save_mesh
     from shared.mesh import Mesh
     from shared.overlay import overlay_strip
-    from shared.solve.track_head import choose_references
+    from shared.solve.first_poses import choose_references
+    from shared.solve.judge_track import judge_frames
+    from shared.tracking_pictures import pose_curves, residual_map
 
-    fits, excluded = judge_frames(job, frames, used, presence, track)
-    kept = used[fits]
+    fits, reasons = judge_frames(track, job.params.largest_error)
+    kept, poses, covariance = used[fits], track.camera_from_head[fits], track.covariance[fits]
+    gain = track.focal_gain if track.focal_solved else 1.0
+    lens = zoomed(frames.intrinsics, gain)
     save_arrays(
         job.out / "poses.npz",
-        camera_from_head=track.camera_from_head[fits],
-        covariance=track.covariance[fits],
+        camera_from_head=poses,
+        covariance=covariance,
         frame_index=frames.frame_index[kept],
-        intrinsics=frames.intrinsics_source,
-        intrinsics_crop=frames.intrinsics,
+        intrinsics=zoomed(frames.intrinsics_source, gain),
+        intrinsics_crop=lens,
     )
     mesh = Mesh(track.fit.vertices, model.faces, model.uvs, model.face_uvs)
     save_mesh(job.out / "mesh.npz", mesh, face_segment=model.face_segment)
@@ -176,23 +209,29 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
     )
     residual = np.nanmedian(track.error_px[fits], axis=0)
     save_arrays(job.out / "tracks.npz", points_head=track.points_head, residual_px=residual)
+    excluded = excluded_frames(frames, used, presence, reasons)
     write_json(job.out / "tracking.json", summarise(job, frames, model, track, fits, excluded))
-    shown = kept[choose_references(track.camera_from_head[fits], 5)]
-    pictures = [eight_bit(frames.read_codes(i)) for i in shown]
-    poses = [track.camera_from_head[np.nonzero(used == i)[0][0]] for i in shown]
-    write_png(job.out / "overlay.png", overlay_strip(pictures, mesh, poses, frames.intrinsics, landmarks_px[shown]))
+    chosen = choose_references(poses, 5)
+    pictures = [eight_bit(frames.read_codes(i)) for i in kept[chosen]]
+    write_png(job.out / "overlay.png", overlay_strip(pictures, mesh, poses[chosen], lens, landmarks_px[kept[chosen]]))
+    write_png(job.out / "curves.png", pose_curves(poses, covariance, frames.time_s[kept]))
+    write_png(job.out / "residuals.png", residual_map(mesh, track.points_head, residual))
 
 
 def run(job: Job) -> None:
     """Landmarks, tracks, poses, head."""
     from shared.errors import InputError
     from shared.io.frames import FrameSet
+    from shared.io.given_tracking import read_given_poses
     from shared.io.models import load_head_model
-    from shared.solve.fit_head import FitWeights
-    from shared.solve.track_head import TrackSettings, track_head
+    from shared.solve.track_head import track_head
 
     frames, model = FrameSet.open(job.input("sample_frames")), load_head_model().subdivided()
     landmarks_px, presence = read_landmarks(job, frames)
+    given_poses = None
+    if job.subject.poses is not None:
+        given_poses, posed = read_given_poses(job.subject.poses, frames.frame_index)
+        presence = np.where(posed, presence, 0.0)
     used = np.nonzero(presence > 0)[0]
     if len(used) < 3:
         raise InputError(
@@ -202,17 +241,8 @@ def run(job: Job) -> None:
             expected="3 or more",
             mend="film one head, facing the camera at the start, 200 px wide or more",
         )
-    params = job.params
-    settings = TrackSettings(
-        passes=params.passes,
-        references=params.references,
-        tracks_per_reference=params.tracks,
-        warp_width_px=params.warp_width,
-        loss_scale_px=params.loss_scale,
-        prior_mm=params.point_prior,
-        fit=FitWeights(stiffness=params.stiffness),
-    )
-    track = track_head(build_clip(job, frames, used, landmarks_px), model, settings, job.progress, job.note)
+    clip = build_clip(job, frames, used, landmarks_px, given_poses)
+    track = track_head(clip, model, read_settings(job, frames.focal_known), job.progress, job.note)
     publish(job, frames, model, used, landmarks_px, presence, track)
 
 
@@ -222,12 +252,15 @@ def check(job: Job) -> None:
     from shared.io.arrays import load_arrays, read_json
     from shared.io.meshes import load_mesh
 
-    poses = load_arrays(job.out / "poses.npz")["camera_from_head"]
+    arrays = load_arrays(job.out / "poses.npz")
+    poses, covariance = arrays["camera_from_head"], arrays["covariance"]
     rotation = poses[:, :3, :3]
     if not np.allclose(rotation @ np.swapaxes(rotation, 1, 2), np.eye(3), atol=1e-6):
         raise LimnError("poses are not rigid")
     if not (np.isfinite(poses).all() and (poses[:, 2, 3] > 0).all()):
         raise LimnError("the head is not before the camera in every frame")
+    if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance).min() >= -1e-12):
+        raise LimnError("a pose has no covariance")
     height = np.ptp(load_mesh(job.out / "mesh.npz").vertices[:, 1])
     if not 150.0 < height < 450.0:
         raise LimnError(f"the fitted head and neck are {height:.0f} mm high; expected 150 to 450")

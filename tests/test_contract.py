@@ -77,7 +77,17 @@ def test_bad_command_line_is_one_line_and_writes_nothing(call, tmp_path, capsys,
     ("video: clip.txt\ncamera: {focal_length_px: 900, focal_length_mm: 60, sensor_width_mm: 36}\n", "keep one"),
     ("video: clip.txt\ncolour: {transfer: sRBG}\n", "did you mean srgb?"),
     ("video: clip.txt\ncapture: {moves: light}\n", "head | camera"),
-    ("video: clip.txt\ncapture: head\n", "not a mapping")])
+    ("video: clip.txt\ncapture: head\n", "not a mapping"),
+    ("video: clip.txt\ntracking: {poses: ../poses.npz}\n", "leaves the subject's folder"),
+    ("video: clip.txt\ntracking: {landmarks: /etc/hostname}\n", "leaves the subject's folder"),
+    ("video: clip.txt\ntracking: {landmarks: gone.npz}\n", "tracking.landmarks: no such file"),
+    ("video: clip.txt\ntracking: {poses: empty.mp4}\n", "tracking.poses: no such file"),
+    ("video: clip.txt\ntracking: {poses: [a]}\n", "no file named"),
+    ("video: clip.txt\ntracking: {hold_poses: true}\n", "hold_poses without poses"),
+    ("video: clip.txt\ntracking: {landmarks: clip.txt, hold_poses: true}\n", "hold_poses without poses"),
+    ("video: clip.txt\ntracking: {poses: clip.txt, hold_poses: always}\n", "true | false"),
+    ("video: clip.txt\ntracking: {pose: clip.txt}\n", "did you mean poses?"),
+    ("video: clip.txt\ntracking: poses.npz\n", "not a mapping")])
 def test_bad_subject_is_one_line_and_writes_nothing(call, tmp_path, capsys, settings, hint):
     folder = make_subject(tmp_path / "bo", settings=settings)
     (folder / "empty.mp4").touch()

@@ -6,6 +6,8 @@ from toy_runs import copy_pipeline, make_subject
 from shared.contract import Output, Parameter, Stage, load_subject
 from shared.contract.declare import parameter_table
 from shared.contract.folders import RunFolder
+from shared.contract.hashing import HashMemory
+from shared.contract.manifest import source_inputs
 from shared.contract.pipeline import load_pipeline, split_settings
 from shared.contract.source import fingerprint, read_declaration
 from shared.errors import InputError, LimnError
@@ -66,6 +68,41 @@ def test_subject_facts(tmp_path):
     assert [path.name for path in subject.video_files()] == ["009.png", "010.png"]
     assert (subject.name, subject.focal_length_mm, subject.sensor_width_mm) == ("eve", 60.0, 22.3)
     assert (subject.focal_length_px, subject.transfer, subject.moves) == (None, "bt709", "camera")
+
+
+def test_subject_names_files_of_another_tracker(tmp_path):
+    folder = make_subject(tmp_path / "eve")
+    bare = load_subject(folder)
+    assert (bare.landmarks, bare.poses, bare.hold_poses) == (None, None, False)
+    (folder / "mine").mkdir()
+    (folder / "mine" / "poses.npz").write_bytes(b"x")
+    (folder / "subject.yaml").write_text("video: clip.txt\ntracking: {poses: mine/poses.npz, hold_poses: true}\n")
+    given = load_subject(folder)
+    assert (given.landmarks, given.poses, given.hold_poses) == (None, folder / "mine/poses.npz", True)
+    assert given.content() == bare.content()
+
+
+def test_files_of_another_tracker_are_inputs_of_the_stage_that_reads_them(tmp_path):
+    folder = make_subject(tmp_path / "eve", settings="video: clip.txt\n")
+    outputs = (Output("text.txt", "the text"),)
+    reads = Stage("track", 1, "Tracks.", ("read_text",), outputs, given=("landmarks", "poses"))
+    other = Stage("draw", 1, "Draws.", ("read_text",), outputs)
+
+    def inputs(stage, poses=b"poses", tracking="poses: p.npz"):
+        (folder / "p.npz").write_bytes(poses)
+        (folder / "q.npz").write_bytes(b"poses")
+        (folder / "subject.yaml").write_text(f"video: clip.txt\ntracking: {{{tracking}}}\n")
+        return source_inputs(stage, load_subject(folder), HashMemory(tmp_path / "hashes.json"))
+
+    assert set(inputs(reads)) == {"subject.yaml", "poses"}
+    assert set(inputs(reads, tracking="poses: p.npz, landmarks: q.npz")) == {"subject.yaml", "poses", "landmarks"}
+    assert set(inputs(reads, tracking="")) == {"subject.yaml"}
+    assert inputs(reads) == inputs(reads, tracking="poses: q.npz")  # content, not name
+    held = "poses: p.npz, hold_poses: true"
+    keys = [inputs(reads)["poses"], inputs(reads, b"others")["poses"], inputs(reads, tracking=held)["poses"]]
+    assert len(set(keys)) == 3
+    for tracking in ("", "landmarks: q.npz", held):
+        assert inputs(other, b"others", tracking) == inputs(other)
 
 
 def test_declaration_is_read_without_the_stage_s_imports(tmp_path):

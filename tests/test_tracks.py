@@ -28,6 +28,10 @@ def texture(size=512):
     return (128 + 40 * noise / noise.std()).clip(20, 240).astype(np.float32)
 
 
+def contrast(image, sigma_px=4.0):
+    return local_contrast(image, sigma_px, 1.5 * sigma_px, 0.02)
+
+
 def render(pose, image, gain=1.0):
     """What the camera sees of the textured plane, as uint8."""
     scene = RayScene(PLANE.vertices, PLANE.faces)
@@ -54,7 +58,7 @@ def test_tracks_find_the_skin_where_it_is_despite_a_change_of_light():
     positions, _ = project(PLANE.vertices, believed, LENS)
     tracks, where = dense_tracks(
         grid,
-        [local_contrast(image, 4.0) for image in images],
+        [contrast(image) for image in images],
         [np.zeros((SIZE, SIZE), np.uint8)] * 3,
         positions,
         np.ones((3, len(PLANE.vertices)), bool),
@@ -70,7 +74,7 @@ def test_tracks_find_the_skin_where_it_is_despite_a_change_of_light():
 
 def test_hidden_vertices_give_no_tracks():
     true = poses()
-    image = local_contrast(render(true[0], texture()), 4.0)
+    image = contrast(render(true[0], texture()))
     grid = grid_from_landmarks(project(PLANE.vertices, true[0], LENS)[0], 0, 1.0)
     visible = np.ones((2, len(PLANE.vertices)), bool)
     visible[1] = False
@@ -104,5 +108,14 @@ def test_clipped_and_crushed_pixels_are_unusable():
 
 def test_local_contrast_ignores_gain():
     image = np.clip(texture(128), 60, 200)
-    bright, dark = local_contrast(image.astype(np.uint8), 5.0), local_contrast((image * 0.5).astype(np.uint8), 5.0)
+    bright, dark = contrast(image.astype(np.uint8), 5.0), contrast((image * 0.5).astype(np.uint8), 5.0)
     assert np.corrcoef(bright.ravel().astype(float), dark.ravel().astype(float))[0, 1] > 0.97
+
+
+def test_local_contrast_s_floor_leaves_noise_dark():
+    rng = np.random.default_rng(1)
+    noise = (100 + rng.normal(size=(80, 80))).round().astype(np.uint8)
+    loud, quiet = (local_contrast(noise, 4.0, 6.0, floor).astype(float).std() for floor in (0.001, 0.1))
+    assert quiet < 0.2 * loud
+    flat = local_contrast(np.full((40, 40), 90, np.uint8), 4.0, 6.0, 0.02)
+    assert np.abs(flat.astype(int) - 128).max() <= 1

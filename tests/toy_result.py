@@ -98,7 +98,7 @@ def _write_solution(folder: Path) -> None:
     radiance = np.random.default_rng(7).uniform(0.1, 3.0, (8, 16, 3))
     write_exr(folder / "envmap.exr", radiance, colour_space="lin_rec709_scene", latlong=True)
     save_mesh(folder / "mesh.npz", toy_mesh())
-    save_arrays(folder / "poses.npz", camera_from_head=toy_poses(), frame_index=FRAMES)
+    save_arrays(folder / "poses.npz", camera_from_head=toy_poses(), frame_index=FRAMES, intrinsics=INTRINSICS)
     for frame in RENDERED:
         render = np.zeros((*CROP_SIZE[::-1], 3), np.float32)
         render[20:60, 20:70] = [0.4, 0.3, 0.25]

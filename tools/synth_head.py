@@ -71,18 +71,20 @@ def _bumps(model: HeadModel, mesh: Mesh, rng: np.random.Generator) -> np.ndarray
     return vertex_normals(mesh.vertices, mesh.faces) * height[:, None]
 
 
-def head_turn(frames: int, distance_mm: float, height_mm: float, seed: int) -> np.ndarray:
+def head_turn(
+    frames: int, distance_mm: float, height_mm: float, seed: int, yaw_deg: float = YAW_DEG, pitch_deg: float = PITCH_DEG
+) -> np.ndarray:
     """camera_from_head [F, 4, 4]: a slow look to one side, to the other, up and down, and back.
 
     The head turns about a pivot in the neck and drifts a little; height_mm: head-space y at the image centre when the
-    head looks straight ahead.
+    head looks straight ahead; yaw_deg, pitch_deg: how far it turns and nods to either side.
     """
     rng = np.random.default_rng([seed, 2])
     time = (np.arange(frames) + 0.25) / frames
     sway = np.where(time < 0.5, -np.sin(4 * np.pi * time), 0.0)
     nod = np.where(time >= 0.5, -np.sin(4 * np.pi * time), 0.0)
     drift = np.stack([_smooth_random(time, rng) for _ in range(6)], 1)
-    angles = np.radians(np.stack([PITCH_DEG * nod, YAW_DEG * sway, 0 * time], 1) + DRIFT_DEG * drift[:, :3])
+    angles = np.radians(np.stack([pitch_deg * nod, yaw_deg * sway, 0 * time], 1) + DRIFT_DEG * drift[:, :3])
     turn = (rotation_from_vector(angles * [0, 1, 0]) @ rotation_from_vector(angles * [1, 0, 0])
             @ rotation_from_vector(angles * [0, 0, 1]))
     world_place = NECK_PIVOT - turn @ NECK_PIVOT - [0.0, height_mm, 0.0] + DRIFT_MM * drift[:, 3:]

@@ -154,7 +154,15 @@ def _sky(directions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return light
 
 
-ENVIRONMENTS = {"room": _room, "studio": _studio, "sky": _sky}
+def _lamp(directions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """One small strong lamp at the side in a nearly dark room: half of the face black, cast shadows with hard edges."""
+    light = np.full((*directions.shape[:-1], 3), 0.02)
+    side = rng.choice([-1.0, 1.0])
+    light += _disc(directions, side * rng.uniform(66, 74), rng.uniform(10, 25), 4) * [260.0, 245.0, 220.0]
+    return light
+
+
+ENVIRONMENTS = {"room": _room, "studio": _studio, "sky": _sky, "lamp": _lamp}
 
 
 def _gradient(directions: np.ndarray, floor: tuple, horizon: tuple, zenith: tuple) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Make a head-turn clip whose every truth is known: the demo subject, and at tiny size the tests' subject.
 
-    python -m tools.synthesize DEST [--preset demo|tiny] [--size 400] [--frames 48] [--seed 0] [--light room] ...
+    python -m tools.synthesize DEST [--preset demo|tiny] [--size 400] [--frames 48] [--seed 0] [--light lamp] ...
 
 Writes:  DEST/subject.yaml, capture.json, the clip (video.avi, or frames/%04d.png), synthesis.json (how it was made);
          gt/: mesh.obj, albedo.exr, specular.exr, roughness.exr, mask.exr (UV), envmap.exr, poses.npz, and for some
@@ -32,13 +32,16 @@ from shared.io.arrays import save_arrays, write_json
 from shared.io.models import load_head_model
 from tools import synth_output
 from tools.synth_camera import Camera, PictureQuality
-from tools.synth_head import Head, face_part, head_turn, random_head
+from tools.synth_head import PITCH_DEG, YAW_DEG, Head, face_part, head_turn, random_head
 from tools.synth_irradiance import IrradianceQuality, Shot
 from tools.synth_light import ENVIRONMENTS, procedural_environment
 from tools.synth_render import RenderQuality, Scene, render
 from tools.synth_skin import Complexion, SkinPainter
 
-FOCAL_MM, SENSOR_MM, DISTANCE_MM, FPS = 60.0, 22.3, 950.0, 25.0
+SENSOR_MM, FPS = 22.3, 25.0
+DISTANCE_PER_FOCAL = 950.0 / 60.0
+"""The camera stands where the head fills the same part of the picture, whatever its lens."""
+
 TOP_MARGIN_MM = 27.0
 FACE_RADIANCE = 0.32
 """Mean linear radiance of the face, seen from the front, to which the exposure is set."""
@@ -64,6 +67,9 @@ class Settings:
     noise: float = 0.006
     level: int = 2
     texture: int = 1024
+    focal_mm: float = 60.0
+    yaw_deg: float = YAW_DEG
+    pitch_deg: float = PITCH_DEG
     truth_frames: int = 8
     mantissa_bits: int = 10
     face_truth_only: bool = False
@@ -88,7 +94,7 @@ def synthesize(destination: Path, settings: Settings, processes: int) -> None:
     materials = SkinPainter(head, settings.texture, settings.seed).paint(Complexion(tone=settings.tone))
     lights = tuple(light_of(name, settings) for name in settings.lights)
     scene = Scene(head.mesh, materials, lights)
-    camera = Camera(settings.size, settings.size, FOCAL_MM / SENSOR_MM * settings.size)
+    camera = Camera(settings.size, settings.size, settings.focal_mm / SENSOR_MM * settings.size)
     shots = plan_shots(head, settings)
     truth = np.unique(np.linspace(0, settings.frames - 1, settings.truth_frames).round().astype(int))
     destination.mkdir(parents=True, exist_ok=True)
@@ -104,7 +110,8 @@ def synthesize(destination: Path, settings: Settings, processes: int) -> None:
         _write_relight(destination / "relight", settings, scene, shots[settings.frames:], pictures)
     write_json(destination / "synthesis.json", asdict(settings))
     # Last, so that an interrupted run leaves no subject.
-    synth_output.write_description(destination, camera, FOCAL_MM, SENSOR_MM, settings.frames, FPS, settings.video)
+    lens = settings.focal_mm, SENSOR_MM
+    synth_output.write_description(destination, camera, *lens, settings.frames, FPS, settings.video)
 
 
 def _write_clip(destination: Path, settings: Settings, camera: Camera, truth: np.ndarray,
@@ -150,22 +157,23 @@ def light_of(name: str, settings: Settings) -> np.ndarray:
 
 def plan_shots(head: Head, settings: Settings) -> list[Shot]:
     """The clip's frames, then three views under each further light."""
-    height = head.mesh.vertices[:, 1].max() + TOP_MARGIN_MM - 0.5 * SENSOR_MM / FOCAL_MM * DISTANCE_MM
-    poses = list(head_turn(settings.frames, DISTANCE_MM, height, settings.seed))
+    height = head.mesh.vertices[:, 1].max() + TOP_MARGIN_MM - 0.5 * SENSOR_MM * DISTANCE_PER_FOCAL
+    distance = DISTANCE_PER_FOCAL * settings.focal_mm
+    poses = list(head_turn(settings.frames, distance, height, settings.seed, settings.yaw_deg, settings.pitch_deg))
     light = [0] * settings.frames
     for index in range(1, len(settings.lights)):
-        poses += [relight_pose(yaw, height) for yaw in RELIGHT_YAWS_DEG.values()]
+        poses += [relight_pose(yaw, height, distance) for yaw in RELIGHT_YAWS_DEG.values()]
         light += [index] * len(RELIGHT_YAWS_DEG)
     turns = world_from_head(np.stack(poses), "head")
     return [Shot(pose, turn, which, settings.seed * 1000 + i)
             for i, (pose, turn, which) in enumerate(zip(poses, turns, light, strict=True))]
 
 
-def relight_pose(yaw_deg: float, height_mm: float) -> np.ndarray:
+def relight_pose(yaw_deg: float, height_mm: float, distance_mm: float) -> np.ndarray:
     """camera_from_head [4, 4] turned about the head's own axis."""
     flip = np.diag([1.0, -1.0, -1.0])
     turn = rotation_from_vector(np.array([0.0, np.radians(yaw_deg), 0.0]))
-    return rigid(flip @ turn, np.array([0.0, height_mm, DISTANCE_MM]))
+    return rigid(flip @ turn, np.array([0.0, height_mm, distance_mm]))
 
 
 def parse(arguments: list[str] | None) -> tuple[Path, Settings, int]:
@@ -179,11 +187,15 @@ def parse(arguments: list[str] | None) -> tuple[Path, Settings, int]:
     parser.add_argument("--eyes", choices=("open", "closed"))
     parser.add_argument("--tone", type=float, help="melanin: 0.15 fair to 1.6 dark")
     parser.add_argument("--light", choices=ENVIRONMENTS, help="the clip's light")
+    parser.add_argument("--focal", dest="focal_mm", type=float, help="focal length, mm, on a sensor 22.3 mm wide")
+    parser.add_argument("--yaw", dest="yaw_deg", type=float, help="how far the head turns to each side, degrees")
+    parser.add_argument("--pitch", dest="pitch_deg", type=float, help="how far it nods up and down, degrees")
     parser.add_argument("--noise", type=float, help="sensor noise at full scale, share of it")
     parser.add_argument("--processes", type=int, default=2, help="worker processes (default 2)")
     options = parser.parse_args(arguments)
     settings = PRESETS[options.preset]
-    given = {name: getattr(options, name) for name in ("size", "frames", "seed", "eyes", "tone", "noise")}
+    given = {name: getattr(options, name) for name in
+             ("size", "frames", "seed", "eyes", "tone", "noise", "focal_mm", "yaw_deg", "pitch_deg")}
     settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
     if options.light:
         others = tuple(name for name in settings.lights if name != options.light)
@@ -193,10 +205,11 @@ def parse(arguments: list[str] | None) -> tuple[Path, Settings, int]:
 
 def _checked(settings: Settings) -> Settings:
     for name, low, high in (("size", 64, 2048), ("frames", 8, 1000), ("seed", 0, 10**6), ("tone", 0.05, 2.0),
-                            ("noise", 0.0, 0.1)):
+                            ("noise", 0.0, 0.1), ("focal_mm", 15.0, 500.0), ("yaw_deg", 0.0, 60.0),
+                            ("pitch_deg", 0.0, 40.0)):
         value = getattr(settings, name)
         if not low <= value <= high:
-            raise InputError("out of range", where=f"--{name}", got=value, expected=f"{low} to {high}")
+            raise InputError("out of range", where=f"--{name.split('_')[0]}", got=value, expected=f"{low} to {high}")
     return settings
 
 

@@ -130,8 +130,9 @@ SEED = Parameter("seed", int, 0, "Seed of every random choice in the stage.", ""
 class Stage:
     """Declaration of one stage. `seed` is added to the parameters of each.
 
-    inputs: stages whose folders are read. A stage without inputs reads the subject's video. A stage named export_*
-    publishes to `export/`, all others to `work/<name>/`.
+    inputs: stages whose folders are read. A stage without inputs reads the subject's video. given: files of the subject
+    that are read where subject.yaml names them. A stage named export_* publishes to `export/`, all others to
+    `work/<name>/`.
     """
 
     name: str
@@ -140,6 +141,7 @@ class Stage:
     inputs: tuple[str, ...]
     outputs: tuple[Output, ...]
     parameters: tuple[Parameter, ...] = ()
+    given: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "inputs", tuple(self.inputs))

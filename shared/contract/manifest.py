@@ -76,11 +76,17 @@ def make_work(stage: Stage, parameters: Mapping[str, object], inputs: Mapping[st
 
 
 def source_inputs(stage: Stage, subject: Subject, memory: HashMemory) -> dict[str, str]:
-    """{name: SHA-256} of what the stage reads of the subject itself: its settings and, of the first stage, the clip."""
+    """{name: SHA-256} of what the stage reads of the subject itself.
+
+    That is its settings, of the first stage the clip, and files of another tracker.
+    """
     inputs = {SUBJECT_INPUT: hash_value(subject.content())}
     if stage.reads_source:
         files = [[path.name, memory.hash(path)] for path in subject.video_files()]
         inputs[VIDEO_INPUT] = hash_value([subject.video_name(), files])
+    for name in stage.given:
+        if (file := getattr(subject, name)) is not None:
+            inputs[name] = hash_value([memory.hash(file), name == "poses" and subject.hold_poses])
     return inputs
 
 

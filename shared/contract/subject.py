@@ -12,6 +12,9 @@ from shared.errors import InputError
 
 TRANSFERS = ("srgb", "bt709", "linear")
 MOVES = ("head", "camera")
+GIVEN = ("landmarks", "poses")
+"""Files that a user may bring from another tracker."""
+
 _COUNTER = re.compile(r"%(?:0?(\d+))?d")
 _CAMERA = (
     Parameter("focal_length_mm", float, None, "Focal length of the lens.", "mm", 1.0, 5000.0),
@@ -25,7 +28,8 @@ _NEW = "make a subject with: limn new CLIP"
 class Subject:
     """Facts of subject.yaml. video: absolute path of the file, or of an image sequence with a counter (%05d).
 
-    focal_length_px: of the source frame; None with focal_length_mm also None means: estimate it.
+    focal_length_px: of the source frame; None with focal_length_mm also None means: estimate it. landmarks, poses:
+    files of another tracker; hold_poses: whether its poses stay as they are.
     """
 
     folder: Path
@@ -36,9 +40,12 @@ class Subject:
     sensor_width_mm: float | None = None
     transfer: str = "srgb"
     moves: str = "head"
+    landmarks: Path | None = None
+    poses: Path | None = None
+    hold_poses: bool = False
 
     def content(self) -> dict[str, object]:
-        """All that subject.yaml says besides the video, independent of where the folder lies."""
+        """All that every stage depends on, independent of where the folder lies."""
         keys = ("focal_length_px", "focal_length_mm", "sensor_width_mm", "transfer", "moves")
         return {key: getattr(self, key) for key in keys}
 
@@ -77,14 +84,15 @@ def load_subject(folder: Path) -> Subject:
         raise InputError("no such folder", where=str(folder), mend=_NEW)
     if not path.is_file():
         raise InputError("no subject.yaml in this folder", where=str(folder), mend=_NEW)
-    content = check_keys(read_yaml(path), ("video", "camera", "colour", "capture"), str(path))
+    content = check_keys(read_yaml(path), ("video", "camera", "colour", "capture", "tracking"), str(path))
     camera = _camera(check_keys(content.get("camera"), [p.name for p in _CAMERA], f"{path}: camera"), path)
     colour = check_keys(content.get("colour"), ("transfer",), f"{path}: colour")
     capture = check_keys(content.get("capture"), ("moves",), f"{path}: capture")
     video = _video(folder, content.get("video"), path)
     transfer = _choice(colour.get("transfer", "srgb"), TRANSFERS, f"{path}: colour.transfer")
     moves = _choice(capture.get("moves", "head"), MOVES, f"{path}: capture.moves")
-    subject = Subject(folder, folder.resolve().name, video, transfer=transfer, moves=moves, **camera)
+    given = _tracking(folder, content.get("tracking"), f"{path}: tracking")
+    subject = Subject(folder, folder.resolve().name, video, transfer=transfer, moves=moves, **camera, **given)
     _check_files(subject)
     return subject
 
@@ -107,19 +115,42 @@ def _choice(value: object, known: tuple[str, ...], where: str) -> str:
     return str(value)
 
 
-def _video(folder: Path, value: object, path: Path) -> Path:
-    """The video's absolute path; it must be written as a path that stays inside the subject's folder."""
-    where = f"{path}: video"
+def _tracking(folder: Path, given: object, where: str) -> dict[str, object]:
+    """Files of another tracker, and whether its poses are held."""
+    given = check_keys(given, (*GIVEN, "hold_poses"), where)
+    files = {name: _inside(folder, given[name], f"{where}.{name}") for name in GIVEN if given.get(name) is not None}
+    for name, file in files.items():
+        if not file.is_file() or file.stat().st_size == 0:
+            raise InputError("no such file, or empty", where=f"{where}.{name}", got=given[name])
+    hold = given.get("hold_poses", False)
+    if not isinstance(hold, bool):
+        raise InputError("value not known", where=f"{where}.hold_poses", got=repr(hold), expected="true | false")
+    if hold and "poses" not in files:
+        raise InputError("hold_poses without poses", where=where, mend="add poses: FILE.npz, or leave hold_poses out")
+    return {**files, "hold_poses": hold}
+
+
+def _inside(folder: Path, value: object, where: str) -> Path:
+    """The absolute path of a file that is named by a path which stays inside the subject's folder."""
     if not isinstance(value, str) or not value.strip():
-        raise InputError("no video named", where=where, expected="a file in the subject's folder, e.g. clip.mp4")
+        raise InputError("no file named", where=where, expected="a file in the subject's folder")
     relative = PurePosixPath(value)
     if relative.is_absolute() or ".." in relative.parts or "\\" in value or "\0" in value:
         raise InputError("the path leaves the subject's folder", where=where, got=value,
                          expected="a path inside it (a symbolic link there may point elsewhere)")
-    if len(_COUNTER.findall(value)) > len(_COUNTER.findall(relative.name)) or len(_COUNTER.findall(value)) > 1:
+    return folder / relative
+
+
+def _video(folder: Path, value: object, path: Path) -> Path:
+    """The video's absolute path; an image sequence has one counter, in the file's name."""
+    where = f"{path}: video"
+    if not isinstance(value, str) or not value.strip():
+        raise InputError("no video named", where=where, expected="a file in the subject's folder, e.g. clip.mp4")
+    file = _inside(folder, value, where)
+    if len(_COUNTER.findall(value)) > len(_COUNTER.findall(file.name)) or len(_COUNTER.findall(value)) > 1:
         raise InputError("more than one counter, or one in a folder's name", where=where, got=value,
                          expected="one in the file's name, e.g. frames/%05d.png")
-    return folder / relative
+    return file
 
 
 def _check_files(subject: Subject) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,15 +48,19 @@ def read_inputs(
 ) -> tuple[ClipInputs, FrameSet, np.ndarray]:
     """From the folders of sample_frames and track_landmarks -> inputs, the frames, frame_index [F] in the source.
 
+    The intrinsics are those of track_landmarks, which may have solved the focal length.
+
     mesh_path (.npz or .obj) and pose_path (.npz) replace the tracked ones when not empty. InputError when fewer than
     three poses belong to sampled frames.
     """
-    frames = FrameSet.open(sampled)
+    tracked_poses = load_arrays(tracked / "poses.npz")
+    lens = {"intrinsics": tracked_poses["intrinsics_crop"], "intrinsics_source": tracked_poses["intrinsics"]}
+    frames = replace(FrameSet.open(sampled), **lens)
     path = Path(mesh_path) if mesh_path else tracked / "mesh.npz"
     mesh = read_obj(path) if path.suffix == ".obj" else load_mesh(path)
     segment = load_arrays(path).get("face_segment") if path.suffix == ".npz" else None
     names = tuple(read_json(tracked / "tracking.json")["segments"])
-    poses = load_arrays(Path(pose_path) if pose_path else tracked / "poses.npz")
+    poses = load_arrays(Path(pose_path)) if pose_path else tracked_poses
     pose, index, place = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
     inputs = ClipInputs(mesh, pose, frames.intrinsics, frames.size, frames.moves, frames, place, segment, names)
     return inputs, frames, index

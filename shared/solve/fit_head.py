@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from shared.geometry import project, rotation_from_vector, similarity_from_points
 from shared.head_model import HeadModel
 from shared.mesh import interpolate, uniform_laplacian, vertex_normals
+from shared.raycast import RayScene
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class HeadFit:
 
 
 EFFECTIVE_TRACKS = 100.0
+SURFACE_REACH_MM = 8.0
 APERTURES = np.array(
     [(160, 144), (159, 145), (158, 153), (387, 373), (386, 374), (385, 380), (82, 87), (13, 14), (312, 317)]
 )
@@ -69,13 +71,17 @@ class FitWeights:
     aperture_mm: float = 0.7
     identity: float = 1.0
     expression: float = 0.6
-    stiffness: float = 4.0
-
+    stiffness: float = 0.25
 
     def for_depth_noise(self, noise_mm: float) -> FitWeights:
         """For track points whose depth is uncertain by noise_mm: the model counts more, the surface is stiffer."""
         track_mm = float(np.hypot(self.track_mm, noise_mm))
         return replace(self, track_mm=track_mm, stiffness=self.stiffness * (1.0 + (noise_mm / 0.5) ** 2))
+
+
+PUBLISHED = FitWeights(track_mm=2.8 * (100.0 / 30.0) ** 0.5, landmark_mm=2.8)
+"""Landmarks 100, skin 30, as Xu et al. (ICCV 2025) weigh landmark and photometric losses: what the pictures say of the
+skin reaches the fit here as tracks."""
 
 
 def fit_codes(
@@ -194,23 +200,52 @@ def _closest(vertices, normals, usable, points, reach_mm):
 def fit_surface(
     model: HeadModel, fit: HeadFit, points: np.ndarray, weights: FitWeights, iterations: int = 5
 ) -> HeadFit:
-    """The free correction: vertices move by a thin plate through the track points [N, 3] (track space)."""
+    """The free correction: vertices move by a thin plate through the track points [N, 3] (track space).
+
+    Each point pulls the place on the surface that lies under it along the normal, not the nearest vertex: between
+    vertices a curved surface sags.
+    """
     count = len(fit.vertices)
     laplacian = uniform_laplacian(model.faces, count)
-    plate = (laplacian.T @ laplacian).tocsr()
-    usable = _fit_vertices(model)
+    plate = (laplacian.T @ laplacian).tocsr() + 1e-4 * sparse.identity(count)
     in_head, vertices = fit.to_head(points), fit.vertices
     for step in range(iterations):
         stiffness = weights.stiffness * 4.0 ** (iterations - 1 - step)
-        normals = vertex_normals(vertices, model.faces)
-        near, offset, weight = _closest(vertices, normals, usable, in_head, 8.0)
-        load = np.bincount(near, weight, count)
-        pull = np.bincount(near, weight * offset, count)
-        target = (vertices - fit.vertices) + normals * (pull / np.maximum(load, 1e-9))[:, None]
-        matrix = sparse.diags(load) + stiffness * plate + 1e-4 * sparse.identity(count)
-        correction = splu(matrix.tocsc()).solve(load[:, None] * target)
-        vertices = fit.vertices + correction
+        under = _under(model, vertices, in_head, SURFACE_REACH_MM)
+        interpolation = sparse.csr_matrix(
+            (under.bary.ravel(), (np.repeat(np.arange(len(under.bary)), 3), model.faces[under.face].ravel())),
+            shape=(len(under.bary), count),
+        )
+        wanted = interpolation @ (vertices - fit.vertices) + under.offset[:, None] * under.normal
+        weighted = sparse.diags(under.weight) @ interpolation
+        matrix = interpolation.T @ weighted + stiffness * plate
+        vertices = fit.vertices + splu(matrix.tocsc()).solve(weighted.T @ wanted)
     return HeadFit(fit.scale, fit.rotation, fit.translation, fit.identity, fit.expression, vertices)
+
+
+@dataclass(frozen=True)
+class _Under:
+    """Places under points along the normal: face [n], bary [n, 3], offset [n] mm, normal [n, 3], Cauchy weight [n]."""
+
+    face: np.ndarray
+    bary: np.ndarray
+    offset: np.ndarray
+    normal: np.ndarray
+    weight: np.ndarray
+
+
+def _under(model: HeadModel, vertices: np.ndarray, points: np.ndarray, reach_mm: float) -> _Under:
+    normals, usable = vertex_normals(vertices, model.faces), _fit_vertices(model)
+    _, nearest = cKDTree(vertices[usable]).query(points)
+    along = normals[usable[nearest]]
+    face, bary, distance = RayScene(vertices, model.faces).intersect(points + reach_mm * along, -along)
+    offset = distance - reach_mm  # of the point above the surface
+    hit = (face >= 0) & (np.abs(offset) < reach_mm)
+    hit[hit] &= (interpolate(normals, model.faces, face[hit], bary[hit]) * along[hit]).sum(1) > 0.5
+    spread = 3.0 * np.median(np.abs(offset[hit])) + 0.05
+    offset = offset[hit].astype(np.float64)
+    weight = 1.0 / (1.0 + (offset / spread) ** 2)
+    return _Under(face[hit], bary[hit].astype(np.float64), offset, along[hit], weight)
 
 
 def landmarks_on_points(

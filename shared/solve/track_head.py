@@ -1,70 +1,56 @@
-"""From landmarks to poses that hold still: landmark start, dense tracks in passes, bundle adjustment, head fit.
+"""From landmarks to poses that hold still: landmark start, dense flow, tracks against the mean texture, head fit.
 
-Each pass warps all frames by what the last one found (first the landmarks' triangulation, then the fitted head), tracks
-the skin densely from a few reference frames, adjusts poses and points as one rigid body, and fits the head again. The
-search narrows from pass to pass.
+The first poses come from a subset of the frames. The fitted head then carries the mean texture of the clip, all frames
+are tracked against it twice, first widely, then in the finest detail, and each time adjusted as one rigid body.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from shared.bundle import BundleSolution, adjust, pose_covariance, pose_from_points
-from shared.errors import InputError
-from shared.geometry import camera_centres, project
+from shared.bundle import BundleSolution, place_points, zoomed
+from shared.bundle_problem import Tracks
+from shared.geometry import camera_centres, rigid
 from shared.head_model import HeadModel
-from shared.mesh import normalised, vertex_normals
-from shared.raycast import RayScene
-from shared.solve.fit_head import FitWeights, HeadFit, fit_codes, fit_surface, landmarks_on_points, triangulate
-from shared.tracks import (
-    SurfaceGrid,
-    dense_tracks,
-    grid_from_landmarks,
-    grid_from_mesh,
-    points_on_grid,
-    visible_vertices,
+from shared.mesh import normalised
+from shared.solve.first_poses import (
+    LOSS,
+    Adjusted,
+    FlowSettings,
+    flow_over_head,
+    flow_over_landmarks,
+    interpolate_poses,
+    start_from_landmarks,
 )
-
-UNTRACKED_SEGMENTS = ("eyes", "eye_sockets", "inner_mouth", "neck", "scalp", "ears")
-"""Not rigid with the skull, or hair: no tracks from there."""
+from shared.solve.fit_head import FitWeights, HeadFit, fit_codes, fit_surface, landmarks_on_points
+from shared.solve.pose_trust import trust
+from shared.solve.texture_tracking import TexturePass, coarse_pass, solve_texture, track_texture
+from shared.solve.tracked_clip import TrackedClip
+from shared.texture_tracks import Windows
 
 LANDMARK_FRAMES = 15
 """Landmarks are taken from so many frames around the middle of the motion."""
 
-LEAST_TRACKS = 30
-"""A frame with fewer tracks has no reliable pose."""
+HELD_OUT_EVERY = 8
+"""One fine track in so many is held out to judge the poses."""
 
 
 @dataclass(frozen=True)
 class TrackSettings:
-    """passes after the first; references per pass; tracks per reference; sizes in pixels and millimetres."""
+    """start_frames: frames that the first poses come from; tracks: in a fine pass; texel_px: texels of its atlas."""
 
-    passes: int = 2
-    references: int = 3
-    tracks_per_reference: int = 1500
-    warp_width_px: float = 480.0
-    loss_scale_px: float = 0.2
-    prior_mm: float = 5.0
+    flow: FlowSettings = field(default_factory=FlowSettings)
+    start_frames: int = 60
+    fine_passes: int = 1
+    tracks: int = 2500
+    texel_px: float = 1.0
+    window_sigma: float = 5.0
+    prior_mm: float = 10.0
+    estimate_focal: bool = False
     fit: FitWeights = field(default_factory=FitWeights)
-
-
-@dataclass(frozen=True)
-class Clip:
-    """What tracking looks at: F contrast images, F masks of unusable pixels, landmarks [F, 468, 2] px, the lens."""
-
-    contrast: list[np.ndarray]
-    unusable: list[np.ndarray]
-    landmarks_px: np.ndarray
-    intrinsics: np.ndarray
-    size: tuple[int, int]
-
-    @property
-    def face_width_px(self) -> float:
-        """Median width of the landmarks' box."""
-        return float(np.median(np.ptp(self.landmarks_px[..., 0], axis=1)))
 
 
 @dataclass(frozen=True)
@@ -72,6 +58,9 @@ class HeadTrack:
     """The result: poses [F, 4, 4] and covariance [F, 6, 6] of all F frames given, the fitted head, the track points.
 
     error_px [F, N]: reprojection error of each track point, NaN where not seen; reliable [F]: enough tracks.
+    noise_factor: see shared.solve.pose_trust. focal_gain, focal_deviation: the focal length over the given one had it
+    been solved, and the deviation of its logarithm; focal_solved: the result belongs to the solved one. held_out_px:
+    median error of tracks kept aside, under the poses before and after the last fine pass.
     """
 
     camera_from_head: np.ndarray
@@ -80,210 +69,111 @@ class HeadTrack:
     points_head: np.ndarray
     error_px: np.ndarray
     reliable: np.ndarray
-
-
-def start_from_landmarks(clip: Clip, model: HeadModel) -> tuple[BundleSolution, np.ndarray]:
-    """Poses by robust PnP on the mean head's landmarks, then a bundle adjustment of the landmarks themselves.
-
-    -> solution over all 468 points, and which frames have a pose [F] bool. InputError when fewer than three have.
-    """
-    known = (model.landmark_face >= 0) & (model.landmark_weight > 0)
-    named = model.landmarks(model.template)
-    poses = [
-        pose_from_points(named[known], frame[known], clip.intrinsics, clip.size, 0.08 * clip.face_width_px)
-        for frame in clip.landmarks_px
-    ]
-    posed = np.array([pose is not None and pose[2, 3] > 0 for pose in poses])
-    if posed.sum() < 3:
-        raise InputError(
-            "the landmarks fit no head in this clip", got=f"{posed.sum()} frames with a pose", expected="3 or more"
-        )
-    poses = _filled(poses, posed)
-    points = np.where(known[:, None], named, 0.0)
-    unknown = ~known
-    points[unknown] = triangulate(clip.landmarks_px[posed][:, unknown], poses[posed], clip.intrinsics)
-    observed = np.where(posed[:, None, None], clip.landmarks_px, np.nan)
-    solution = adjust(
-        observed[posed], poses[posed], points, clip.intrinsics, clip.size, loss_scale_px=2.0, prior_mm=10.0
-    )
-    poses[posed] = solution.camera_from_points
-    residuals = np.full(clip.landmarks_px.shape, np.nan)
-    residuals[posed] = solution.residuals_px
-    return BundleSolution(poses, solution.points, residuals), posed
-
-
-def _filled(poses: list, posed: np.ndarray) -> np.ndarray:
-    """Frames without a pose take their nearest neighbour's as a start."""
-    have = np.nonzero(posed)[0]
-    return np.stack([poses[have[np.argmin(np.abs(have - i))]] for i in range(len(poses))])
-
-
-def choose_references(camera_from_points: np.ndarray, count: int) -> list[int]:
-    """Frames whose view directions cover the clip: the central one, then towards both ends of the principal motion."""
-    directions = normalised(camera_centres(camera_from_points))
-    mean = normalised(directions.mean(0))
-    spread = directions - directions @ mean[:, None] * mean
-    axes = np.linalg.svd(spread - spread.mean(0), full_matrices=False)[2][:2]
-    along = spread @ axes.T
-    middle = np.median(along, axis=0)
-    targets = [middle]
-    for axis in (0, 1):
-        for end in (along[:, axis].max(), along[:, axis].min()):
-            target = middle.copy()
-            target[axis] += 0.55 * (end - middle[axis])
-            targets.append(target)
-    chosen = [int(np.argmin(((along - target) ** 2).sum(1))) for target in targets[:count]]
-    return list(dict.fromkeys(chosen))
+    noise_factor: float
+    focal_gain: float
+    focal_deviation: float
+    focal_solved: bool
+    held_out_px: tuple[float, float]
 
 
 def track_head(
-    clip: Clip, model: HeadModel, settings: TrackSettings, progress: Callable, note: Callable[[str], None]
+    clip: TrackedClip, model: HeadModel, settings: TrackSettings, progress: Callable, note: Callable[[str], None]
 ) -> HeadTrack:
     """The whole solution. model: subdivided once; progress(iterable, label) wraps the long loops; note(text) logs."""
-    start, posed = start_from_landmarks(clip, model)
+    chosen = np.unique(np.linspace(0, clip.count - 1, min(settings.start_frames, clip.count)).round().astype(int))
+    few = clip.subset(chosen)
+    start, posed = start_from_landmarks(few, model, few.given_poses)
     note(f"landmarks: {posed.sum()} of {len(posed)} frames with a pose, {np.nanmedian(start.error_px):.2f} px")
-    solution, reliable = _first_pass(clip, start, posed, settings, progress)
-    for index in range(settings.passes):
-        note(_summary(f"pass {index}", solution, reliable))
-        fit = _fit(clip, model, solution, reliable, settings)
-        solution, reliable = _mesh_pass(clip, model, solution, reliable, fit, settings, index, progress)
-    note(_summary(f"pass {settings.passes}", solution, reliable))
-    fit = _fit(clip, model, solution, reliable, settings)
-    covariance = np.full((len(reliable), 6, 6), np.nan)
-    covariance[reliable] = _head_covariance(solution, reliable, clip.intrinsics, fit.scale)
+    found = flow_over_landmarks(few, start, posed, settings.flow, progress)
+    note(_summary("flow over landmarks", found))
+    found = flow_over_head(few, model, _fit(few, model, found, settings), found, settings.flow, progress)
+    note(_summary("flow over the head", found))
+
+    fit = _fit(few, model, found, settings)
+    poses, known = _onto_all(clip, chosen, fit, found)
+    found = _texture_pass(clip, model, fit, poses, known, coarse_pass(clip.face_width_px), progress)
+    note(_summary("tracks", found))
+    fine = TexturePass(
+        settings.texel_px, True, settings.tracks, Windows(sigma=settings.window_sigma), settings.prior_mm
+    )
+    for _ in range(settings.fine_passes):
+        fit = _fit(clip, model, found, settings)
+        before = fit.camera_from_head(found.solution.camera_from_points)
+        finer, aside = _fine_pass(clip, model, fit, before, found.reliable, fine, progress)
+        note(_summary("fine tracks", finer))
+        held_out = tuple(_held_out_px(clip, aside, poses) for poses in (before, finer.solution.camera_from_points))
+        if held_out[1] > held_out[0]:
+            note(f"dropped: tracks kept aside went from {held_out[0]:.3f} to {held_out[1]:.3f} px")
+            break
+        found = finer
+    trusted = trust(clip, found, settings.prior_mm, settings.estimate_focal)
+    found = trusted.adjusted
+    note(f"noise factor {trusted.noise_factor:.2f}, focal length {trusted.focal_gain:.4f} of the given one")
+    lens = zoomed(clip.intrinsics, trusted.focal_gain if trusted.focal_solved else 1.0)
+    fit = _fit(replace(clip, intrinsics=lens), model, found, settings)
+    unit = np.r_[1.0, 1.0, 1.0, np.full(3, fit.scale)]
     return HeadTrack(
-        fit.camera_from_head(solution.camera_from_points),
-        covariance,
-        fit,
-        fit.to_head(solution.points),
-        solution.error_px,
-        reliable,
+        camera_from_head=fit.camera_from_head(found.solution.camera_from_points),
+        covariance=trusted.covariance * np.outer(unit, unit),
+        fit=fit,
+        points_head=fit.to_head(found.solution.points),
+        error_px=found.solution.error_px,
+        reliable=found.reliable,
+        noise_factor=trusted.noise_factor,
+        focal_gain=trusted.focal_gain,
+        focal_deviation=trusted.focal_deviation,
+        focal_solved=trusted.focal_solved,
+        held_out_px=held_out,
     )
 
 
-def _summary(label: str, solution: BundleSolution, reliable: np.ndarray) -> str:
-    error = np.nanmedian(solution.error_px)
-    return f"{label}: {solution.points.shape[0]} tracks, {error:.3f} px median, {reliable.sum()} frames"
+def _onto_all(clip, chosen, fit, found) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of all frames from those of the chosen, and which of them are known [F] bool."""
+    poses = fit.camera_from_head(found.solution.camera_from_points)
+    if clip.hold_poses:
+        return carried_poses(clip.given_poses, clip.given_poses[chosen], poses), np.ones(clip.count, bool)
+    known = np.zeros(clip.count, bool)
+    known[chosen[found.reliable]] = True
+    return interpolate_poses(poses[found.reliable], clip.time_s[known], clip.time_s), known
 
 
-def _head_covariance(solution, reliable, intrinsics, scale) -> np.ndarray:
-    """Covariance of the reliable frames with translations in the head's millimetres."""
-    subset = BundleSolution(
-        solution.camera_from_points[reliable], solution.points, solution.residuals_px[reliable]
-    )
-    unit = np.r_[1.0, 1.0, 1.0, np.full(3, scale)]
-    return pose_covariance(subset, intrinsics) * np.outer(unit, unit)
+def carried_poses(poses: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Poses [F, 4, 4] in the head space and scale of target, which are the poses source [K, 4, 4] in another space."""
+    turn = source[0, :3, :3].T @ target[0, :3, :3]
+    rows = np.concatenate([source[:, :3, 3:], source[:, :3, :3]], axis=2).reshape(-1, 4)
+    scale, *shift = np.linalg.lstsq(rows, target[:, :3, 3].ravel(), rcond=None)[0]
+    return rigid(poses[:, :3, :3] @ turn, scale * poses[:, :3, 3] + poses[:, :3, :3] @ shift)
 
 
-def _first_pass(clip, start, posed, settings, progress) -> tuple[BundleSolution, np.ndarray]:
-    """Dense tracks over the landmarks' triangulation, from the frame that stands in the middle."""
-    index = np.nonzero(posed)[0]
-    reference = int(index[choose_references(start.camera_from_points[posed], 1)[0]])
-    grid = grid_from_landmarks(clip.landmarks_px[reference], reference, _scale(clip, settings))
-    visible = np.repeat(posed[:, None], clip.landmarks_px.shape[1], axis=1)
-    tracks, where = dense_tracks(
-        grid,
-        clip.contrast,
-        clip.unusable,
-        clip.landmarks_px,
-        visible,
-        count=settings.tracks_per_reference,
-        search_px=0.03 * clip.face_width_px,
-        progress=lambda frames: progress(frames, "first tracks"),
-    )
-    points = points_on_grid(grid, where, start.points)
-    loss, prior = 2.5 * settings.loss_scale_px, 2.0 * settings.prior_mm
-    return _adjusted(clip, tracks, points, start.camera_from_points, loss, prior)
+def _texture_pass(clip, model, fit, poses, known, settings, progress) -> Adjusted:
+    tracked = np.ones(clip.count, bool)
+    tracks, points, poses = track_texture(clip, model, fit.vertices, poses, known, tracked, settings, progress)
+    return solve_texture(clip, tracks, points, poses, settings.prior_mm)
 
 
-def _mesh_pass(clip, model, solution, reliable, fit, settings, index, progress) -> tuple[BundleSolution, np.ndarray]:
-    """Dense tracks over the fitted head, from several reference frames."""
-    poses = fit.camera_from_head(solution.camera_from_points)
-    scene = RayScene(fit.vertices, model.faces)
-    positions, _ = project(fit.vertices, poses, clip.intrinsics)
-    normals = vertex_normals(fit.vertices, model.faces)
-    visible = np.stack([visible_vertices(scene, fit.vertices, normals, pose, 0.3) for pose in poses])
-    visible[~reliable] = False
-    untracked = [i for i, name in enumerate(model.segment_names) if name in UNTRACKED_SEGMENTS]
-    usable_face = ~np.isin(model.face_segment, untracked)
-    candidates = np.nonzero(reliable)[0]
-    tracks, points = [], []
-    count = settings.tracks_per_reference // (1 if index == settings.passes - 1 else 2)  # the last pass decides
-    references = choose_references(poses[candidates], settings.references)
-    for number, chosen in enumerate(references, start=1):
-        reference, label = int(candidates[chosen]), f"tracks, pass {index + 1}, view {number} of {len(references)}"
-        grid = _mesh_grid(clip, model, scene, fit, usable_face, poses, reference, settings)
-        found, where = dense_tracks(
-            grid,
-            clip.contrast,
-            clip.unusable,
-            positions,
-            visible,
-            count=count,
-            search_px=(0.015, 0.01)[min(index, 1)] * clip.face_width_px + 1.0,
-            progress=lambda frames, label=label: progress(frames, label),
-        )
-        tracks.append(found)
-        points.append(points_on_grid(grid, where, fit.vertices))
-    tracks, points = np.concatenate(tracks, axis=1), np.concatenate(points)
-    loss = settings.loss_scale_px * (1.25, 1.0)[min(index, 1)]
-    return _adjusted(clip, tracks, points, poses, loss, settings.prior_mm)
+def _fine_pass(clip, model, fit, poses, reliable, settings, progress) -> tuple[Adjusted, tuple[Tracks, np.ndarray]]:
+    """The adjusted fine tracks, and some that were kept aside, with their points."""
+    tracks, points, poses = track_texture(clip, model, fit.vertices, poses, reliable, reliable, settings, progress)
+    aside = np.arange(len(points)) % HELD_OUT_EVERY == HELD_OUT_EVERY // 2
+    found = solve_texture(clip, tracks.subset(points=~aside), points[~aside], poses, settings.prior_mm)
+    return found, (tracks.subset(points=aside), points[aside])
 
 
-def _mesh_grid(clip, model, scene, fit, usable_face, poses, reference, settings) -> SurfaceGrid:
-    tracked = fit.vertices[np.unique(model.faces[usable_face])]
-    pixels, _ = project(tracked, poses[reference], clip.intrinsics)
-    width, height = clip.size
-    low = np.clip(np.floor(pixels.min(0)), 0, [width - 2, height - 2])
-    high = np.clip(np.ceil(pixels.max(0)), low + 1, [width, height])
-    return grid_from_mesh(
-        scene,
-        model.faces,
-        usable_face,
-        poses[reference],
-        clip.intrinsics,
-        np.r_[low, high],
-        reference,
-        _scale(clip, settings),
-    )
+def _held_out_px(clip: TrackedClip, aside: tuple[Tracks, np.ndarray], poses: np.ndarray) -> float:
+    """Median error of tracks that no adjustment has seen, their points placed by the poses [F, 4, 4]."""
+    tracks, points = aside
+    solved = place_points(tracks, poses, points, clip.intrinsics, loss_scale=LOSS, prior_mm=100.0)
+    return float(np.nanmedian(solved.error_px))
 
 
-def _scale(clip: Clip, settings: TrackSettings) -> float:
-    return float(np.clip(settings.warp_width_px / clip.face_width_px, 1.0, 3.0))
+def _summary(label: str, found: Adjusted) -> str:
+    error = np.nanmedian(found.solution.error_px)
+    return f"{label}: {len(found.solution.points)} tracks, {error:.3f} px median, {found.reliable.sum()} frames"
 
 
-def _adjusted(clip, tracks, points, poses, loss_scale_px, prior_mm) -> tuple[BundleSolution, np.ndarray]:
-    """Bundle adjustment of the frames and tracks that have enough observations; the worst 15 % of tracks dropped."""
-    long_enough = np.isfinite(tracks[..., 0]).sum(0) >= max(4, 0.12 * len(poses))
-    tracks, points = tracks[:, long_enough], points[long_enough]
-    reliable = np.isfinite(tracks[..., 0]).sum(1) >= LEAST_TRACKS
-    if reliable.sum() < 3 or tracks.shape[1] < LEAST_TRACKS:
-        raise InputError(
-            "the skin could not be tracked through this clip",
-            got=f"{tracks.shape[1]} tracks, {reliable.sum()} frames with {LEAST_TRACKS} or more",
-            expected="3 or more frames",
-            mend="film sharper, larger or slower: the face should be 200 px wide or more and free of motion blur",
-        )
-    solved = adjust(
-        tracks[reliable],
-        poses[reliable],
-        points,
-        clip.intrinsics,
-        clip.size,
-        loss_scale_px=loss_scale_px,
-        prior_mm=prior_mm,
-    )
-    error = np.nanmedian(np.where(np.isfinite(solved.error_px), solved.error_px, np.nan), axis=0)
-    good = error <= np.nanpercentile(error, 85)
-    residuals = np.full((len(poses), good.sum(), 2), np.nan)
-    residuals[reliable] = solved.residuals_px[:, good]
-    every = np.array(poses, np.float64)
-    every[reliable] = solved.camera_from_points
-    return BundleSolution(every, solved.points[good], residuals), reliable
-
-
-def _fit(clip, model, solution, reliable, settings) -> HeadFit:
+def _fit(clip, model, found: Adjusted, settings) -> HeadFit:
     """Codes, then the free correction, to track points and to the landmarks as they lie among them."""
+    solution, reliable = found.solution, found.reliable
     poses = solution.camera_from_points[reliable]
     directions = normalised(camera_centres(poses))
     central = np.argsort(-(directions @ normalised(directions.mean(0))))[:LANDMARK_FRAMES]

@@ -1,0 +1,240 @@
+"""The bundle adjustment's cost and its linearisation, points eliminated.
+
+Every Jacobian passes through the point in camera axes, so that an observation is worth one 3 x 3 matrix J^T W J and one
+3-vector; the blocks of cameras, points and their coupling follow from these by rotations and levers. Every point is
+seen in most frames, so the reduced camera system is dense, and one matrix product builds it.
+
+Reference: Triggs et al., Bundle adjustment - a modern synthesis, 2000, sections 3.3 (robust cost), 6.1 (elimination).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from shared.geometry import rotation_from_vector
+from shared.motion_prior import MotionPrior
+
+CHUNK_POINTS = 256
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Where F frames show N points: pixels [F, N, 2] (NaN: unseen), whitening [F, N, 2, 2] 1/px.
+
+    whitening @ error has unit covariance where the noise is as measured.
+    """
+
+    pixels: np.ndarray
+    whitening: np.ndarray
+
+    @property
+    def seen(self) -> np.ndarray:
+        """[F, N] bool."""
+        return np.isfinite(self.pixels[..., 0])
+
+    @classmethod
+    def of_equal_noise(cls, pixels: np.ndarray, noise_px: float) -> Tracks:
+        """All observations alike: noise_px is the standard deviation along each axis."""
+        return cls(pixels, np.broadcast_to(np.eye(2) / noise_px, (*pixels.shape, 2)))
+
+    def subset(self, frames=slice(None), points=slice(None)) -> Tracks:
+        """Chosen frames and points (slices, masks or indices)."""
+        return Tracks(self.pixels[frames][:, points], self.whitening[frames][:, points])
+
+    def with_noise(self, factor: float) -> Tracks:
+        """All noise larger by a factor."""
+        return Tracks(self.pixels, self.whitening / factor)
+
+
+@dataclass(frozen=True)
+class State:
+    """Unknowns: poses [F, 4, 4] (camera_from_points), points [N, 3], log of the focal length's gain."""
+
+    poses: np.ndarray
+    points: np.ndarray
+    log_focal: float = 0.0
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """What some points add to the normal equations.
+
+    cameras [F, 6, 6], camera_rhs [F, 6]; points [n, 3, 3], point_rhs [n, 3]; mixed [n, F, 6, 3]; the focal length's own
+    entries, with the cameras [F, 6] and with the points [n, 3].
+    """
+
+    cameras: np.ndarray
+    camera_rhs: np.ndarray
+    points: np.ndarray
+    point_rhs: np.ndarray
+    mixed: np.ndarray
+    focal: float
+    focal_rhs: float
+    focal_cameras: np.ndarray
+    focal_points: np.ndarray
+
+
+@dataclass(frozen=True)
+class ReducedSystem:
+    """matrix [C, C] @ cameras = rhs [C]; coupling [C, 3 N], half_inverse [N, 3, 3] and point_rhs [N, 3] for points."""
+
+    matrix: np.ndarray
+    rhs: np.ndarray
+    coupling: np.ndarray
+    half_inverse: np.ndarray
+    point_rhs: np.ndarray
+
+
+class BundleProblem:
+    """Whitened reprojection errors under a Cauchy loss, points tied weakly to an anchor, perhaps a motion prior.
+
+    Camera unknowns: rotation vector (camera axes) and translation of each frame, then, if wanted, the log focal gain.
+    """
+
+    def __init__(
+        self,
+        tracks: Tracks,
+        anchor: np.ndarray,
+        intrinsics: np.ndarray,
+        *,
+        loss_scale: float,
+        prior_mm: float = np.inf,
+        motion: MotionPrior | None = None,
+        refine_focal: bool = False,
+        least_views: int = 2,
+    ):
+        """anchor [N, 3] mm; prior_mm: see shared.bundle.adjust; points seen less often than least_views are out."""
+        self.seen = tracks.seen & (tracks.seen.sum(0) >= least_views)
+        self.anchor, self.intrinsics, self.loss_scale = np.array(anchor, np.float64), intrinsics, loss_scale
+        self.motion, self.refine_focal = motion, refine_focal
+        self.unknowns = 6 * len(tracks.pixels) + int(refine_focal)
+        self._pixels = np.where(self.seen[..., None], tracks.pixels, 0.0)
+        self._whitening = tracks.whitening
+        self._anchor_weight = np.maximum(self.seen.sum(0), 1) / prior_mm**2 + 1e-9
+
+    def chunks(self):
+        """Slices over the points that bound the memory."""
+        return (slice(i, i + CHUNK_POINTS) for i in range(0, len(self.anchor), CHUNK_POINTS))
+
+    def cost(self, state: State) -> float:
+        """Cauchy cost of the residuals, the anchor's and the motion's."""
+        total = 0.0
+        for chunk in self.chunks():
+            weight = self._residuals(state, chunk)[1]
+            total -= self.loss_scale**2 * np.log(weight[self.seen[:, chunk]]).sum()
+        total += (self._anchor_weight[:, None] * (state.points - self.anchor) ** 2).sum()
+        return float(total + (0.0 if self.motion is None else self.motion.cost(state.poses)))
+
+    def _residuals(self, state, chunk) -> tuple[np.ndarray, ...]:
+        """Whitened residuals [F, n, 2], Cauchy weights [F, n], points turned into camera axes, and in the camera."""
+        turned = state.points[chunk] @ np.swapaxes(state.poses[:, :3, :3], 1, 2)
+        in_camera = turned + state.poses[:, None, :3, 3]
+        error = in_camera[..., :2] / in_camera[..., 2:] * self._focal(state) + self.intrinsics[:2, 2]
+        error -= self._pixels[:, chunk]
+        whitening = self._whitening[:, chunk]
+        residual = whitening[..., 0] * error[..., :1] + whitening[..., 1] * error[..., 1:]
+        squared = (residual**2).sum(-1) / self.loss_scale**2
+        return residual, np.where(self.seen[:, chunk], 1.0 / (1.0 + squared), 0.0), turned, in_camera
+
+    def _focal(self, state) -> np.ndarray:
+        return self.intrinsics[[0, 1], [0, 1]] * np.exp(state.log_focal)
+
+    def linearised(self, state: State, chunk: slice) -> Blocks:
+        """Normal equations of the points in one chunk."""
+        residual, weight, turned, in_camera = self._residuals(state, chunk)
+        x, y, z = np.moveaxis(in_camera, -1, 0)
+        focal, whitening = self._focal(state), self._whitening[:, chunk]
+        by_x, by_y = whitening[..., 0] * (focal[0] / z)[..., None], whitening[..., 1] * (focal[1] / z)[..., None]
+        by_z = -(by_x * (x / z)[..., None] + by_y * (y / z)[..., None])
+        jacobian = np.stack([by_x, by_y, by_z], axis=-1)
+        weighted = jacobian * weight[..., None, None]
+        inner = np.swapaxes(weighted, -1, -2) @ jacobian
+        pull = -(weighted * residual[..., None]).sum(-2)
+        rotation, lever = state.poses[:, None, :3, :3], _cross_matrix(turned)
+        lever_inner, by_point = lever @ inner, inner @ rotation
+        cameras = np.empty((len(inner), 6, 6))
+        cameras[:, :3, :3] = -(lever_inner @ lever).sum(1)
+        cameras[:, :3, 3:] = lever_inner.sum(1)
+        cameras[:, 3:, :3] = np.swapaxes(cameras[:, :3, 3:], 1, 2)
+        cameras[:, 3:, 3:] = inner.sum(1)
+        points = (np.swapaxes(rotation, -1, -2) @ by_point).sum(0)
+        points[:, [0, 1, 2], [0, 1, 2]] += self._anchor_weight[chunk, None]
+        point_rhs = (pull @ state.poses[:, :3, :3]).sum(0)
+        point_rhs -= self._anchor_weight[chunk, None] * (state.points[chunk] - self.anchor[chunk])
+        # a longer focal length moves a pixel as a point does that moves away from the axis
+        sideways = in_camera * [1.0, 1.0, 0.0]
+        growing = (inner @ sideways[..., None])[..., 0]
+        return Blocks(
+            cameras=cameras,
+            camera_rhs=np.concatenate([np.cross(turned, pull).sum(1), pull.sum(1)], axis=1),
+            points=points,
+            point_rhs=point_rhs,
+            mixed=np.concatenate([lever @ by_point, by_point], axis=2).transpose(1, 0, 2, 3),
+            focal=float((growing * sideways).sum()),
+            focal_rhs=float((pull * sideways).sum()),
+            focal_cameras=np.concatenate([np.cross(turned, growing).sum(1), growing.sum(1)], axis=1),
+            focal_points=(growing @ state.poses[:, :3, :3]).sum(0),
+        )
+
+    def reduced_system(self, state: State) -> ReducedSystem:
+        """Gauss-Newton system of the cameras with the points eliminated (Schur complement)."""
+        frames, count = self.seen.shape
+        size = 6 * frames
+        matrix, rhs = np.zeros((self.unknowns,) * 2), np.zeros(self.unknowns)
+        coupling = np.empty((self.unknowns, 3 * count))
+        half_inverse, point_rhs = np.empty((count, 3, 3)), np.empty((count, 3))
+        cameras = np.zeros((frames, 6, 6))
+        for chunk in self.chunks():
+            block = self.linearised(state, chunk)
+            half = np.linalg.cholesky(np.linalg.inv(block.points))
+            columns = slice(3 * chunk.start, 3 * (chunk.start + len(half)))
+            coupling[:size, columns] = (block.mixed @ half[:, None]).transpose(1, 2, 0, 3).reshape(size, -1)
+            half_inverse[chunk], point_rhs[chunk] = half, block.point_rhs
+            cameras += block.cameras
+            rhs[:size] += block.camera_rhs.ravel()
+            if self.refine_focal:
+                coupling[-1, columns] = np.einsum("nj,njk->nk", block.focal_points, half).ravel()
+                matrix[-1, :size] += block.focal_cameras.ravel()
+                matrix[-1, -1] += block.focal
+                rhs[-1] += block.focal_rhs
+        if self.refine_focal:
+            matrix[:size, -1] = matrix[-1, :size]
+        for f in range(frames):
+            matrix[6 * f : 6 * f + 6, 6 * f : 6 * f + 6] = cameras[f]
+        matrix -= coupling @ coupling.T
+        rhs -= coupling @ np.einsum("njk,nj->nk", half_inverse, point_rhs).ravel()
+        if self.motion is not None:
+            for axis, (normal, pull) in enumerate(zip(*self.motion.normal_equations(state.poses), strict=True)):
+                matrix[axis:size:6, axis:size:6] += normal
+                rhs[axis:size:6] += pull
+        return ReducedSystem(matrix, rhs, coupling, half_inverse, point_rhs)
+
+    def step(self, state: State, system: ReducedSystem, damping: float) -> State:
+        """Solves the damped camera system, then each point for itself."""
+        matrix = system.matrix + damping * np.diag(np.diag(system.matrix) + 1e-12)
+        cameras = cho_solve(cho_factor(matrix, check_finite=False), system.rhs, check_finite=False)
+        frames = len(state.poses)
+        half, coupled = system.half_inverse, (system.coupling.T @ cameras).reshape(-1, 3)
+        own = np.einsum("njk,nj->nk", half, system.point_rhs)
+        points = state.points + np.einsum("njk,nk->nj", half, own - coupled)
+        poses = moved(state.poses, cameras[: 6 * frames].reshape(frames, 6))
+        return State(poses, points, state.log_focal + (float(cameras[-1]) if self.refine_focal else 0.0))
+
+
+def moved(poses: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """Poses [F, 4, 4] turned and shifted by [F, 6]: rotation vector in camera axes, translation."""
+    result = poses.copy()
+    result[:, :3, :3] = rotation_from_vector(motion[:, :3]) @ poses[:, :3, :3]
+    result[:, :3, 3] += motion[:, 3:]
+    return result
+
+
+def _cross_matrix(vectors: np.ndarray) -> np.ndarray:
+    """[..., 3] -> [..., 3, 3] with matrix @ x = vector x x."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    rows = ((zero, -z, y), (z, zero, -x), (-y, x, zero))
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

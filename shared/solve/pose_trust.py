@@ -1,0 +1,124 @@
+"""How far the poses can be trusted: the last adjustment with its measured noise, its covariance, and the focal length.
+
+Errors of neighbouring tracks go along with each other, so that counting tracks flatters the poses. Two halves of the
+face, in patches like a chessboard, are solved for themselves: how far they disagree, against what their own covariances
+promise, gives the factor by which all noise is larger.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.bundle import BundleSolution, adjust, pose_covariance
+from shared.bundle_problem import Tracks
+from shared.geometry import vector_from_rotation
+from shared.motion_prior import motion_prior_of
+from shared.solve.first_poses import LOSS, Adjusted, adjust_clip
+from shared.solve.tracked_clip import TrackedClip
+
+LEAST_HALF = 10
+
+PATCHES_MM = (40.0, 70.0)
+"""Edges of the chessboard's fields; small ones see no error that a whole cheek shares."""
+
+SHARED_ERRORS = 1.75
+"""What both halves of the face get wrong together (shading, the codec), over what they disagree in: measured on
+synthesised clips, 1.3 to 1.8."""
+
+LARGEST_FOCAL_DEVIATION = 0.05
+FOCAL_DEVIATIONS = 3.0
+
+CHI_SQUARED_MEDIAN_3 = 2.366
+
+
+@dataclass(frozen=True)
+class TrustedPoses:
+    """The last solution of the reliable frames: covariance [F, 6, 6] (NaN elsewhere), noise_factor, the lens's check.
+
+    focal_gain and focal_deviation: solved over given, had it been left free, and the logarithm's standard deviation;
+    focal_solved: the poses belong to the solved one.
+    """
+
+    adjusted: Adjusted
+    covariance: np.ndarray
+    noise_factor: float
+    focal_gain: float
+    focal_deviation: float
+    focal_solved: bool
+
+
+def noise_factor(
+    tracks: Tracks, solution: BundleSolution, intrinsics: np.ndarray, prior_mm: float
+) -> float:
+    """By how much the whitening overstates what the tracks know of the poses: at least 1.
+
+    Two halves of the face give two whole solutions, points and all. Median over frames of the squared Mahalanobis
+    distance between their rotations, over that of unit noise; the largest over several ways to halve. Frames that show
+    too little of either half stay aside.
+    """
+    covariance = pose_covariance(solution, tracks, intrinsics, loss_scale=LOSS).poses[:, :3, :3]
+    ratios = [1.0]
+    for patch_mm in PATCHES_MM:
+        odd = np.floor(solution.points / patch_mm).astype(int).sum(1) % 2 == 1
+        shown = np.minimum(tracks.seen[:, odd].sum(1), tracks.seen[:, ~odd].sum(1)) >= LEAST_HALF
+        if shown.sum() < 3:
+            continue
+        halves = [
+            adjust(
+                tracks.subset(shown, half),
+                solution.camera_from_points[shown],
+                solution.points[half],
+                intrinsics,
+                loss_scale=LOSS,
+                prior_mm=prior_mm,
+            ).camera_from_points[:, :3, :3]
+            for half in (odd, ~odd)
+        ]
+        apart = rotations_apart(*halves)
+        distance = np.einsum("fi,fi->f", apart, np.linalg.solve(4.0 * covariance[shown], apart[..., None])[..., 0])
+        ratios.append(float(np.sqrt(np.median(distance) / CHI_SQUARED_MEDIAN_3)))
+    return max(ratios)
+
+
+def rotations_apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Rotation vectors [F, 3] (camera axes) between rotations [F, 3, 3], but for a common turn of the head."""
+    u, _, vt = np.linalg.svd(np.einsum("fji,fjk->ik", second, first))
+    common = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return vector_from_rotation(first @ np.swapaxes(second @ common, 1, 2))
+
+
+def trust(clip: TrackedClip, last: Adjusted, prior_mm: float, estimate_focal: bool) -> TrustedPoses:
+    """The last adjustment, with noise as measured and the motion prior, and its covariance.
+
+    estimate_focal: the focal length is a guess, so that the solved one is taken over where the clip determines it.
+    """
+    shown, solution = last.reliable, last.solution
+    poses, time_s = solution.camera_from_points[shown], clip.time_s[shown]
+    tracks = last.tracks.subset(shown)
+    start = BundleSolution(poses, solution.points, solution.residuals_px[shown])
+    factor = SHARED_ERRORS * noise_factor(tracks, start, clip.intrinsics, prior_mm)
+    tracks, loss = tracks.with_noise(factor), LOSS / factor
+    motion = motion_prior_of(poses, time_s)
+    solved = adjust_clip(clip, tracks, poses, solution.points, prior_mm, loss, motion=motion)
+    lens, points = clip.intrinsics, solution.points
+    free = adjust(
+        tracks, poses, points, lens, loss_scale=loss, prior_mm=prior_mm, motion=motion, refine_focal=True
+    )
+    uncertain = pose_covariance(free, tracks, lens, loss_scale=loss, motion=motion, with_focal=True)
+    solve_focal = estimate_focal and not clip.hold_poses and uncertain.log_focal < LARGEST_FOCAL_DEVIATION
+    solved = free if solve_focal else solved
+    known = uncertain if solve_focal else pose_covariance(solved, tracks, lens, loss_scale=loss, motion=motion)
+    covariance = np.full((len(shown), 6, 6), np.nan)
+    covariance[shown] = known.poses
+    if not solve_focal and abs(np.log(free.focal_gain)) > FOCAL_DEVIATIONS * uncertain.log_focal:
+        # the tracks contradict the lens: the poses are as uncertain as the two answers are apart
+        apart = rotations_apart(solved.camera_from_points[:, :3, :3], free.camera_from_points[:, :3, :3])
+        covariance[shown, :3, :3] += apart[:, :, None] * apart[:, None, :]
+    every = np.array(solution.camera_from_points)
+    every[shown] = solved.camera_from_points
+    residuals = np.full(solution.residuals_px.shape, np.nan)
+    residuals[shown] = solved.residuals_px
+    final = Adjusted(BundleSolution(every, solved.points, residuals, solved.focal_gain), last.tracks, shown)
+    return TrustedPoses(final, covariance, factor, free.focal_gain, uncertain.log_focal, solve_focal)

@@ -1,0 +1,139 @@
+"""How far poses can be trusted: against synthetic tracks whose true poses are known."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from shared.bundle import BundleSolution, adjust, zoomed
+from shared.bundle_problem import Tracks
+from shared.geometry import project, rigid, rotation_from_vector
+from shared.solve.first_poses import LOSS, Adjusted
+from shared.solve.pose_trust import SHARED_ERRORS, noise_factor, rotations_apart, trust
+from shared.solve.tracked_clip import TrackedClip
+
+LENS = np.array([[1500.0, 0, 320], [0, 1500.0, 320], [0, 0, 1]])
+NOISE_PX = 0.1
+FRAMES, POINTS, PRIOR_MM = 20, 300, 30.0
+CHI_SQUARED_90_3 = 6.25
+
+
+def face():
+    rng = np.random.default_rng(0)
+    cloud = rng.uniform(-1, 1, size=(POINTS, 3)) * [60, 80, 4]
+    cloud[:, 2] += 50 - cloud[:, 0] ** 2 / 80 - cloud[:, 1] ** 2 / 160
+    return cloud
+
+
+def turn():
+    angle = np.sin(np.linspace(0, 2 * np.pi, FRAMES))
+    vectors = np.stack([0.15 * angle[::-1], np.radians(25) * angle, 0.02 * angle], axis=1)
+    return rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors), np.tile([0.0, 0, 950.0], (FRAMES, 1)))
+
+
+def noise(cloud, shared_mm, seed):
+    """[F, N, 2] of NOISE_PX; with shared_mm, tracks nearer to each other than that err alike."""
+    rng = np.random.default_rng(seed)
+    raw = rng.normal(size=(FRAMES, POINTS, 2))
+    if shared_mm:
+        near = cKDTree(cloud).query_ball_point(cloud, shared_mm)
+        raw = np.stack([raw[:, members].mean(1) * np.sqrt(len(members)) for members in near], axis=1)
+    return NOISE_PX * raw
+
+
+def solved(shared_mm=0.0, seed=0, lens=LENS):
+    """Tracks of the turning face and their bundle adjustment -> tracks, solution."""
+    cloud, poses = face(), turn()
+    tracks = Tracks.of_equal_noise(project(cloud, poses, LENS)[0] + noise(cloud, shared_mm, seed), NOISE_PX)
+    return tracks, adjust(tracks, poses, cloud, lens, loss_scale=LOSS, prior_mm=PRIOR_MM)
+
+
+def clip_of(lens=LENS, hold_poses=False):
+    """A clip of which only lens and times matter."""
+    return TrackedClip([], [], [], np.zeros((FRAMES, 468, 2)), np.arange(FRAMES) / 15.0, lens, (640, 640),
+                       hold_poses=hold_poses)
+
+
+def all_reliable(tracks, solution):
+    return Adjusted(solution, tracks, np.ones(FRAMES, bool))
+
+
+def test_independent_noise_is_what_the_tracks_say():
+    tracks, solution = solved()
+    assert 1.0 <= noise_factor(tracks, solution, LENS, PRIOR_MM) < 1.3
+
+
+def test_errors_that_neighbours_share_raise_the_noise():
+    alone, little, much = (noise_factor(*solved(mm), LENS, PRIOR_MM) for mm in (0.0, 12.0, 25.0))
+    assert alone < little < much
+    assert much > 2.0
+
+
+def test_few_tracks_leave_the_noise_as_it_is():
+    tracks, solution = solved(25.0)
+    few = np.arange(POINTS) < 12
+    part = BundleSolution(solution.camera_from_points, solution.points[few], solution.residuals_px[:, few])
+    assert noise_factor(tracks.subset(points=few), part, LENS, PRIOR_MM) == 1.0
+
+
+def test_rotations_apart_ignores_a_common_turn():
+    rotations = turn()[:, :3, :3]
+    common = rotation_from_vector(np.array([0.4, -0.3, 0.9]))
+    assert np.abs(rotations_apart(rotations, rotations @ common)).max() < 1e-9
+
+
+def test_rotations_apart_in_camera_axes():
+    rotations = turn()[:, :3, :3]
+    vectors = 0.01 * np.random.default_rng(0).normal(size=(FRAMES, 3))
+    vectors -= vectors.mean(0)
+    apart = rotations_apart(rotation_from_vector(vectors) @ rotations, rotations @ rotation_from_vector(np.ones(3)))
+    assert np.abs(apart - vectors).max() < 0.2 * np.abs(vectors).max()
+    one = np.zeros((FRAMES, 3))
+    one[4] = [0.0, 0.02, 0.0]
+    apart = rotations_apart(rotation_from_vector(one) @ rotations, rotations)
+    assert np.allclose(apart[4], [0.0, 0.02 * (1 - 1 / FRAMES), 0.0], atol=3e-4)
+
+
+@pytest.mark.parametrize("shared_mm", [0.0, 12.0])
+def test_covariance_covers_the_true_errors(shared_mm):
+    tracks, solution = solved(shared_mm, seed=3)
+    trusted = trust(clip_of(), all_reliable(tracks, solution), PRIOR_MM, estimate_focal=False)
+    error = rotations_apart(trusted.adjusted.solution.camera_from_points[:, :3, :3], turn()[:, :3, :3])
+    inverse = np.linalg.inv(trusted.covariance[:, :3, :3])
+    distance = np.einsum("fi,fij,fj->f", error, inverse, error)
+    assert (distance < CHI_SQUARED_90_3).mean() >= 0.8
+    assert np.median(distance) > 0.2  # nor are they promised to be far worse than they are
+    assert trusted.noise_factor >= SHARED_ERRORS and not trusted.focal_solved
+
+
+def test_frames_that_are_not_reliable_have_no_covariance():
+    tracks, solution = solved()
+    reliable = np.arange(FRAMES) != 5
+    poses = np.array(solution.camera_from_points)
+    poses[5] = poses[0]
+    lost = BundleSolution(poses, solution.points, solution.residuals_px)
+    trusted = trust(clip_of(), Adjusted(lost, tracks, reliable), PRIOR_MM, estimate_focal=False)
+    assert np.isnan(trusted.covariance[5]).all() and np.isfinite(trusted.covariance[reliable]).all()
+    assert np.linalg.eigvalsh(trusted.covariance[reliable]).min() > -1e-12
+    assert np.array_equal(trusted.adjusted.solution.camera_from_points[5], poses[5])
+    assert np.isnan(trusted.adjusted.solution.error_px[5]).all()
+
+
+def test_guessed_focal_length_is_solved_and_a_given_one_only_checked():
+    wrong = zoomed(LENS, 1.06)
+    tracks, solution = solved(lens=wrong)
+    last = all_reliable(tracks, solution)
+    guessed = trust(clip_of(wrong), last, PRIOR_MM, estimate_focal=True)
+    given = trust(clip_of(wrong), last, PRIOR_MM, estimate_focal=False)
+    assert guessed.focal_solved and not given.focal_solved
+    assert guessed.focal_gain == given.focal_gain == pytest.approx(1 / 1.06, rel=0.02)
+    assert abs(np.log(guessed.focal_gain * 1.06)) < 3 * guessed.focal_deviation
+    assert guessed.adjusted.solution.focal_gain == guessed.focal_gain
+    assert given.adjusted.solution.focal_gain == 1.0
+
+
+def test_held_poses_stay():
+    tracks, solution = solved()
+    held = BundleSolution(turn(), solution.points, solution.residuals_px)
+    trusted = trust(clip_of(hold_poses=True), all_reliable(tracks, held), PRIOR_MM, estimate_focal=True)
+    assert np.array_equal(trusted.adjusted.solution.camera_from_points, turn())
+    assert not trusted.focal_solved and np.isfinite(trusted.covariance).all()
