@@ -5,6 +5,8 @@ References: IEC 61966-2-1 (sRGB); ITU-R BT.709-6 section 1.2 (camera curve); CIE
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 
 TRANSFERS = ("srgb", "bt709", "linear")
@@ -50,6 +52,8 @@ def linear_rec709_to_lab(rgb: np.ndarray) -> np.ndarray:
 
 def delta_e_2000(rgb_a: np.ndarray, rgb_b: np.ndarray) -> np.ndarray:
     """CIEDE2000 between linear Rec.709 colours [..., 3] -> [...]."""
-    from colour.difference import delta_E_CIE2000  # imports for a second; most callers never need it
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it misses matplotlib, which only its plots need
+        from colour.difference import delta_E_CIE2000  # imports for a second; most callers never need it
 
     return delta_E_CIE2000(linear_rec709_to_lab(rgb_a), linear_rec709_to_lab(rgb_b))

@@ -184,6 +184,40 @@ def test_the_fit_stops_where_held_out_frames_stop_improving(matte):
     assert found.held_out > 0.1 > found.fitted
 
 
+def test_a_step_that_leads_away_is_undone_and_ends_its_resolution(truth, monkeypatch):
+    """The first step that trusts highlights is spoilt: its state may not win, and highlights are not trusted again."""
+    from shared.solve import fit_appearance as module
+
+    capture, _, _ = truth
+    honest, trusted = module._step, []
+
+    def spoilt(solver, settings, trusts):
+        trusted.append(trusts)
+        record = honest(solver, settings, trusts)
+        if trusts:
+            solver.state.albedo = solver.state.albedo * 0.5
+            record |= {"fitted": 3.0 * record["fitted"], "held_out": 3.0 * record["held_out"]}
+        return record
+
+    monkeypatch.setattr(module, "_step", spoilt)
+    found = fit_appearance(capture, Settings(resolutions=(4, 8), steps=5, noise=(0.003, 0.01)))
+    undone = [record for record in found.iterations if record.get("undone")]
+    assert len(undone) == 1 and sum(trusted) == 1
+    assert undone[0]["step"] == SHAPING_STEPS and undone[0]["resolution"] == 4
+    assert found.held_out <= found.iterations[SHAPING_STEPS - 1]["held_out"]
+
+
+def test_samples_that_the_model_cannot_follow_say_less(matte):
+    solver = solver_of(matte[0])
+    weight = torch.ones_like(solver.colours)
+    fitting = solver.evidence(weight)
+    error = 2.0 * torch.ones_like(weight)
+    solver.measure_misfit(solver.colours + error, weight)
+    assert solver.evidence(weight) == pytest.approx(fitting / 4.0, rel=1e-3)
+    solver.measure_misfit(solver.colours + 0.1 * error, weight)
+    assert solver.evidence(weight) == pytest.approx(fitting, rel=1e-6)
+
+
 def test_the_fit_is_deterministic(matte):
     capture, _, _ = matte
     settings = replace(MATTE, resolutions=(4,), steps=2)

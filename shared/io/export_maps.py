@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -24,7 +25,9 @@ WORKING_SPACE, ACESCG = "lin_rec709_scene", "lin_ap1_scene"
 
 def acescg_from_rec709(rgb: np.ndarray) -> np.ndarray:
     """[..., 3] linear Rec.709 -> linear ACEScg, white adapted by Bradford so that grey stays grey."""
-    import colour  # takes a second to load and only this needs it
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it misses matplotlib, which only its plots need
+        import colour  # takes a second to load and only this needs it
 
     matrix = colour.matrix_RGB_to_RGB("ITU-R BT.709", "ACEScg", chromatic_adaptation_transform="Bradford")
     return (np.asarray(rgb, np.float64) @ matrix.T).astype(np.float32)

@@ -124,7 +124,7 @@ class AppearanceSolver:
         self.table = LobeTable(capture.points.normals, capture.transfer.visibility(), capture.directions)
         self.node_to_point = nearest_points(capture.nodes.points, capture.points)
         self.direct = torch.from_numpy(capture.transfer.direct.astype(np.float32))
-        self.trust_highlights = False
+        self.trust_highlights, self.misfit = False, 1.0
         self.lobes: torch.Tensor | None = None
         self.state = self._start()
         self.set_light(settings.light_schedule[0])
@@ -276,9 +276,16 @@ class AppearanceSolver:
         return Highlights(intensity, curvature.double().numpy() * self.evidence(weight), share.double().numpy())
 
     def evidence(self, weight: torch.Tensor) -> float:
-        """Scales the data term so that its samples count as settings.independent ones of unit variance."""
+        """Scales the data term so that its samples count as settings.independent ones of the variance found."""
         count = float((weight * self.fitted > 0).sum()) / 3.0
-        return self.settings.independent / max(count, 1.0)
+        return self.settings.independent / (max(count, 1.0) * self.misfit)
+
+    def measure_misfit(self, model: torch.Tensor, weight: torch.Tensor) -> None:
+        """Variance of the residuals over the assumed noise's, at least 1: where the model cannot follow the clip, the
+        samples say that much less against the priors."""
+        used = weight * self.fitted
+        squared = float((used * (model - self.colours).square()).sum()) / max(float((used > 0).sum()), 1.0)
+        self.misfit = max(1.0, squared)
 
     def residuals(self, model: torch.Tensor) -> tuple[float, float]:
         """Root mean square residual (linear, trust-weighted, censored) on fitted and on held-out frames."""

@@ -18,6 +18,11 @@ _WORTHWHILE, _WORTHWHILE_COARSE = 0.003, 0.03
 """A step that lowers the held-out residual by less than this fraction is the last of its resolution; the first of
 several resolutions is left earlier, since what it cannot resolve keeps its residual high."""
 
+_LARGEST_RISE = 1.05
+"""A step after which the fitted residual is higher by more than this factor is undone, and ends its resolution: the
+specular intensity and the scale follow priors as well as samples, and on a clip that contradicts the model (an
+expression that changes, a palette of few colours) they can lead away from it."""
+
 _SETTLED = 0.06
 """Roughness is searched once steps lower the residual by less than this: under a light that still takes shape, blur
 of the light would pass for roughness. At most as often per resolution as ROUGHNESS_SEARCHES says, first and later."""
@@ -40,19 +45,31 @@ def fit_appearance(
     """Fits light, albedo, specular intensity and roughness; report receives each step's record.
 
     The first steps only give the light its shape; highlights, which then begin to say something about the scale,
-    take part from the fourth. Only states after that, of the light model asked for, can win.
+    take part from the fourth, but not again after a step that had to be undone. Only states after the first steps, of
+    the light model asked for, can win, or the one that a step was undone to.
     """
     solver = AppearanceSolver(capture, settings)
     judges = not capture.fitted.all()  # a clip too short to hold frames out is judged by the fitted ones
     records, best, schedule = [], None, settings.light_schedule
+    trusts = settings.specular
     for stage, (model, resolution) in enumerate(schedule):
         solver.set_light((model, resolution))
         last, searches = np.inf, 0
         worthwhile = _WORTHWHILE if stage == len(schedule) - 1 else _WORTHWHILE_COARSE
         least = SHAPING_STEPS + 2 if stage == 0 else 1
+        kept = None
         for number in range(settings.steps):
             shaping = stage == 0 and number < min(SHAPING_STEPS, settings.steps - 1)
-            record = _step(solver, settings, shaping) | {"light": model, "resolution": resolution, "step": number}
+            record = _step(solver, settings, trusts and not shaping)
+            record |= {"light": model, "resolution": resolution, "step": number}
+            if kept is not None and record["fitted"] > _LARGEST_RISE * kept[0]["fitted"]:
+                solver.state, solver.lobes, trusts = kept[1], None, False
+                records.append(record | {"undone": True})
+                report(records[-1])
+                if best is None and model == settings.light_model:
+                    best = (kept[0]["held_out" if judges else "fitted"], kept[0], _copy(solver.state))
+                break
+            kept = record, _copy(solver.state)
             records.append(record)
             report(record)
             judged = record["held_out" if judges else "fitted"]
@@ -69,9 +86,9 @@ def fit_appearance(
     return Solution(best[2], tuple(records), best[1]["fitted"], best[1]["held_out"])
 
 
-def _step(solver: AppearanceSolver, settings: Settings, shaping: bool) -> dict:
-    """One step of everything; highlights say nothing about the scale before the light has taken shape."""
-    solver.trust_highlights = settings.specular and not shaping
+def _step(solver: AppearanceSolver, settings: Settings, trusts: bool) -> dict:
+    """One step of everything; trusts: highlights say something about the scale and their own strength."""
+    solver.trust_highlights = trusts
     solver.bake()
     if settings.specular and solver.lobes is None:
         solver.bake_lobes()
@@ -80,7 +97,9 @@ def _step(solver: AppearanceSolver, settings: Settings, shaping: bool) -> dict:
     step.settle()
     state = solver.state
     state.node_albedo = state.albedo[solver.node_to_point]
-    fitted, held_out = solver.residuals(solver.model(step.irradiance, step.reflection))
+    model = solver.model(step.irradiance, step.reflection)
+    solver.measure_misfit(model, step.weight)
+    fitted, held_out = solver.residuals(model)
     return {
         "fitted": fitted,
         "held_out": held_out,
