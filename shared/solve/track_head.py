@@ -110,7 +110,7 @@ def track_head(
     found = trusted.adjusted
     note(f"noise factor {trusted.noise_factor:.2f}, focal length {trusted.focal_gain:.4f} of the given one")
     lens = zoomed(clip.intrinsics, trusted.focal_gain if trusted.focal_solved else 1.0)
-    fit = _fit(replace(clip, intrinsics=lens), model, found, settings)
+    fit = _fit(replace(clip, intrinsics=lens), model, found, settings, trusted.noise_factor)
     unit = np.r_[1.0, 1.0, 1.0, np.full(3, fit.scale)]
     return HeadTrack(
         camera_from_head=fit.camera_from_head(found.solution.camera_from_points),
@@ -171,8 +171,11 @@ def _summary(label: str, found: Adjusted) -> str:
     return f"{label}: {len(found.solution.points)} tracks, {error:.3f} px median, {found.reliable.sum()} frames"
 
 
-def _fit(clip, model, found: Adjusted, settings) -> HeadFit:
-    """Codes, then the free correction, to track points and to the landmarks as they lie among them."""
+def _fit(clip, model, found: Adjusted, settings, noise_factor: float = 1.0) -> HeadFit:
+    """Codes, then the free correction, to track points and to the landmarks as they lie among them.
+
+    noise_factor: by how much the tracks' noise is larger than it looks, where that is known.
+    """
     solution, reliable = found.solution, found.reliable
     poses = solution.camera_from_points[reliable]
     directions = normalised(camera_centres(poses))
@@ -180,7 +183,9 @@ def _fit(clip, model, found: Adjusted, settings) -> HeadFit:
     landmarks = landmarks_on_points(
         clip.landmarks_px[reliable][central], poses[central], solution.points, clip.intrinsics
     )
-    weights = settings.fit.for_depth_noise(_depth_noise_mm(solution, poses, clip.intrinsics))
+    # errors that frames share do not average out over a track
+    shared = max(1.0, noise_factor / np.sqrt(np.median(np.isfinite(solution.error_px).sum(0))))
+    weights = settings.fit.for_depth_noise(shared * _depth_noise_mm(solution, poses, clip.intrinsics))
     fit = fit_codes(model, solution.points, landmarks, weights)
     return fit_surface(model, fit, solution.points, weights)
 
