@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from scipy.spatial import Delaunay
 
+from shared.atlas import sample
 from shared.geometry import camera_centres
 from shared.mesh import interpolate, normalised
 from shared.raycast import RayScene, camera_hits
@@ -142,8 +143,8 @@ def dense_tracks(
     tracks = np.full((len(contrast), len(rows), 2), np.nan)
     layout = grid.warp(positions_px[grid.reference])
     layout[~grid.valid] = -9.0
-    target = _sample(contrast[grid.reference], layout)
-    usable = (_sample(unusable[grid.reference], layout, cv2.INTER_NEAREST) == 0) & grid.valid
+    target = sample(contrast[grid.reference], layout)
+    usable = (sample(unusable[grid.reference], layout, cv2.INTER_NEAREST) == 0) & grid.valid
     place = _Places(rows, columns, usable[rows, columns], search_px)
 
     def track(i: int) -> np.ndarray:
@@ -173,7 +174,7 @@ def _track_frame(grid, target, contrast, unusable, layout, shown, place: _Places
     if shown[rows, columns].sum() < LEAST_SHOWN:
         return found
     layout[~shown] = -9.0
-    image = _sample(contrast, layout)
+    image = sample(contrast, layout)
     image[~shown] = 128
     masked = np.where(shown, target, 128).astype(np.uint8)
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -184,7 +185,7 @@ def _track_frame(grid, target, contrast, unusable, layout, shown, place: _Places
     good &= np.linalg.norm(moved, axis=1) < place.search_px * grid.scale
     good &= place.usable & shown[rows, columns]
     reached = _lookup(layout, at)
-    good &= (_sample(unusable, reached[:, None], cv2.INTER_NEAREST)[:, 0] == 0) & (reached.min(1) > 0)
+    good &= (sample(unusable, reached[:, None], cv2.INTER_NEAREST)[:, 0] == 0) & (reached.min(1) > 0)
     found[good] = reached[good]
     return found
 
@@ -197,13 +198,6 @@ def _grid_points(grid: SurfaceGrid, count: int) -> tuple[np.ndarray, np.ndarray]
     rows, columns = np.mgrid[step // 2 : inside.shape[0] : step, step // 2 : inside.shape[1] : step]
     chosen = inside[rows, columns] > 0
     return rows[chosen], columns[chosen]
-
-
-def _sample(image: np.ndarray, positions_px: np.ndarray, method: int = cv2.INTER_LINEAR) -> np.ndarray:
-    """Image values at positions [h, w, 2] in pixels with centres at + 0.5; outside is 0."""
-    return cv2.remap(
-        image, positions_px[..., 0].astype(np.float32) - 0.5, positions_px[..., 1].astype(np.float32) - 0.5, method
-    )
 
 
 def _lookup(field: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ def load_arrays(path: Path | str) -> dict[str, np.ndarray]:
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
         raise InputError("file is missing", where=str(path)) from error
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:  # TypeError: a lone .npy
         raise InputError("not a readable .npz of plain arrays", where=str(path), got=error) from error
 
 

@@ -44,10 +44,7 @@ def read_given_poses(path: Path, frame_index: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _read(path: Path, name: str, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
-    try:
-        arrays = load_arrays(path)
-    except Exception as error:
-        raise InputError("cannot be read as .npz", where=str(path), got=str(error)) from error
+    arrays = load_arrays(path)
     for key in (name, "frame_index"):
         if key not in arrays:
             raise InputError(f"no {key} in the file", where=str(path), got=", ".join(sorted(arrays)))

@@ -6,10 +6,11 @@ import numpy as np
 
 from shared.geometry import camera_centres
 from shared.mesh import normalised
+from shared.solve.pose_trust import FOCAL_DEVIATIONS
 from shared.solve.track_head import HeadTrack
 
 SMALL_ROTATION_DEG = 15.0
-FOCAL_TOLERANCE, FOCAL_DEVIATIONS = 0.03, 3.0
+FOCAL_TOLERANCE = 0.03
 MOUTH_RATIO = 2.0
 """Tracks around the mouth that fit so many times worse than the rest mean talk or a smile that comes and goes."""
 
