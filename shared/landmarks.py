@@ -24,6 +24,8 @@ LANDMARK_SIZE = 192
 MASK_SIZE = 256
 CROP_ENLARGEMENT = 1.5
 MIN_PRESENCE = 0.5
+SETTLING_CROPS = 2
+"""The crop follows the landmarks, which follow the crop: after so many more rounds they hardly move."""
 
 # "Right" is the subject's own right: the left side of an ordinary picture. Closed loops run in order.
 # fmt: off
@@ -99,6 +101,26 @@ class FaceNetworks:
         eyes = previous[EYE_CORNERS_LEFT[0], :2] - previous[EYE_CORNERS_RIGHT[0], :2]
         crop = _crop_to_image((low + high) / 2, float(np.max(high - low)), eyes)
         return self._landmarks_in_crop(rgb, crop)
+
+    def find(
+        self, rgb: np.ndarray, previous: np.ndarray | None, least_presence: float
+    ) -> tuple[float, np.ndarray | None]:
+        """Presence and landmarks [468, 3] px of one frame of a clip; (presence, None) below least_presence.
+
+        previous: landmarks of a neighbouring frame, or None. They only tell which of several faces is meant, and stand
+        in where the detector finds none: what they would add to the crop, the frame would inherit from its neighbour,
+        and a clip run backwards would be tracked otherwise.
+        """
+        faces = self.detect(rgb)
+        if previous is not None and len(faces) > 1:
+            middle = previous[:, :2].mean(axis=0)
+            faces.sort(key=lambda face: np.linalg.norm((face.box[:2] + face.box[2:]) / 2 - middle))
+        certain, points = self.landmarks(rgb, faces[0]) if faces else (0.0, None)
+        if certain < least_presence and previous is not None:
+            certain, points = self.track(rgb, previous)
+        for _ in range(SETTLING_CROPS if certain >= least_presence else 0):
+            certain, points = self.track(rgb, points)
+        return (certain, points) if certain >= least_presence else (certain, None)
 
     def person_mask(self, rgb: np.ndarray) -> np.ndarray:
         """Probability that a pixel shows a person: float32 [H, W] in [0, 1], from one pass at 256 x 256.

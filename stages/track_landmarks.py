@@ -37,7 +37,7 @@ STAGE = Stage(
         Parameter("flow_tracks", int, 1000, "Skin points that flow follows from each.", "points", 100, 20000),
         Parameter("warp_width", float, 320.0, "Width of the face in the flow's pictures.", "px", 100.0, 2000.0),
         Parameter("fine_passes", int, 1, "Passes over the finest detail.", "", 1, 6),
-        Parameter("tracks", int, 2500, "Skin points tracked against the mean texture.", "points", 100, 20000),
+        Parameter("tracks", int, 4000, "Skin points tracked against the mean texture.", "points", 100, 20000),
         Parameter("texel", float, 1.0, "Texels of the mean texture.", "px", 0.5, 8.0),
         Parameter("window", float, 5.0, "Standard width of the windows that are matched.", "texels", 1.5, 30.0),
         Parameter("point_prior", float, 10.0, "Deviation of track points about the fitted head.", "mm", 0.01, 1000.0),
@@ -60,15 +60,9 @@ def read_landmarks(job: Job, frames) -> tuple[np.ndarray, np.ndarray]:
     networks, previous = load_face_networks(), None
     points, presence = np.zeros((frames.count, 468, 2)), np.zeros(frames.count)
     for i in job.progress(range(frames.count), "landmarks"):
-        rgb = eight_bit(frames.read_codes(i))
-        certain, found = networks.track(rgb, previous) if previous is not None else (0.0, None)
-        if certain < job.params.least_presence:
-            faces = networks.detect(rgb)
-            certain, found = networks.landmarks(rgb, faces[0]) if faces else (0.0, None)
-        if found is not None and certain >= job.params.least_presence:
-            points[i], presence[i], previous = found[:, :2], certain, found
-        else:
-            previous = None
+        presence[i], previous = networks.find(eight_bit(frames.read_codes(i)), previous, job.params.least_presence)
+        if previous is not None:
+            points[i] = previous[:, :2]
     return points, presence
 
 

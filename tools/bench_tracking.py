@@ -1,11 +1,13 @@
 """How tracking stands up to bad clips: a table of errors over perturbations of subjects with known truth.
 
-    python -m tools.bench_tracking SUBJECT... --out DIR [--cases plain,flicker,...] [--spoil]
+    python -m tools.bench_tracking SUBJECT... --out DIR [--spoil [--cases flicker,...]]
+    python -m tools.bench_tracking SUBJECT... --out DIR --backwards
 
 Runs sample_frames and track_landmarks on each subject as it is, and with --spoil on the spoilt copies of the first
 (tools/perturb.py) as well. Writes DIR/tracking.csv and tracking.md. Rotations are compared after one common turn of
 the head, so that the mesh does not enter. `covered`: share of frames whose true rotation error lies within the 90 %
-region of the reported covariance.
+region of the reported covariance. With --backwards no truth is needed: each clip is tracked from its first frame and
+from its last, and DIR/backwards.csv and .md say how far the poses are apart.
 """
 
 from __future__ import annotations
@@ -34,6 +36,8 @@ COLUMNS = (
     "case", "frames", "excluded", "rotation_mean_deg", "rotation_max_deg", "jitter_deg", "across_mm", "depth_mm",
     "covered", "geometry_median_mm", "geometry_p95_mm", "reprojection_px", "focal_gain", "seconds", "warnings",
 )  # fmt: skip
+
+BACKWARDS_COLUMNS = ("clip", "frames", "rotation_mean_deg", "rotation_max_deg", "deviation_deg", "focal_gains")
 
 
 def run_stage(stage: str, subject: Path, out: Path) -> float:
@@ -90,20 +94,16 @@ def spoilt_copies(subject: Path, tracked: Path, folder: Path) -> dict[str, Path]
     cases |= {
         "focal_10_longer": lambda to: perturb.spoil_focal(subject, to, 1.1),
         "focal_10_shorter": lambda to: perturb.spoil_focal(subject, to, 0.9),
-        "backwards": lambda to: perturb.spoil_pixels(subject, to, _unspoilt, slice(None, None, -1)),
+        "backwards": lambda to: perturb.spoil_pixels(subject, to, perturb.unspoilt, slice(None, None, -1)),
     }
     for step in (2, 4):
         if frames // step >= 12:
             order = slice(None, None, step)
-            cases[f"every_{step}"] = lambda to, s=order: perturb.spoil_pixels(subject, to, _unspoilt, s)
+            cases[f"every_{step}"] = lambda to, s=order: perturb.spoil_pixels(subject, to, perturb.unspoilt, s)
     for name, make in cases.items():
         if not (folder / name / "subject.yaml").exists():
             make(folder / name)
     return {name: folder / name for name in cases}
-
-
-def _unspoilt(codes: np.ndarray, index: int, count: int) -> np.ndarray:
-    return codes
 
 
 def bench(subject: Path, case: str, out: Path) -> dict[str, object]:
@@ -115,17 +115,46 @@ def bench(subject: Path, case: str, out: Path) -> dict[str, object]:
         return {"case": case, "warnings": str(error)}
 
 
-def write_table(rows: list[dict[str, object]], out: Path) -> None:
-    """tracking.csv and tracking.md."""
-    with open(out / "tracking.csv", "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
+def both_ways(subject: Path, out: Path) -> dict[str, object]:
+    """How far apart the poses are when the clip is tracked from either end. deviation_deg: what the stage reports."""
+    backwards = out / "cases" / f"{subject.name}_backwards"
+    if not (backwards / "subject.yaml").exists():
+        perturb.spoil_pixels(subject, backwards, perturb.unspoilt, slice(None, None, -1))
+    count = len(list((backwards / "frames").iterdir()))
+    results, gains, deviation = [], [], 0.0
+    for clip in (subject, backwards):
+        for stage in ("sample_frames", "track_landmarks"):
+            run_stage(stage, clip, out / "runs")
+        tracked = out / "runs" / clip.name / "work" / "track_landmarks"
+        found, record = load_arrays(tracked / "poses.npz"), read_json(tracked / "tracking.json")
+        index = found["frame_index"] if clip is subject else count - 1 - found["frame_index"]
+        results.append(dict(zip(index.tolist(), found["camera_from_head"][:, :3, :3], strict=True)))
+        gains.append(record["focal"]["gain"])
+        deviation = max(deviation, record["rotation_deviation_deg"]["median"])
+    common = sorted(set(results[0]) & set(results[1]))
+    forward, reverse = (np.stack([result[i] for i in common]) for result in results)
+    angle = np.degrees(np.linalg.norm(rotations_apart(forward, reverse), axis=1))
+    return {
+        "clip": subject.name,
+        "frames": len(common),
+        "rotation_mean_deg": angle.mean(),
+        "rotation_max_deg": angle.max(),
+        "deviation_deg": deviation,
+        "focal_gains": " ".join(f"{gain:.4f}" for gain in gains),
+    }
+
+
+def write_table(rows: list[dict[str, object]], out: Path, name: str = "tracking", columns=COLUMNS) -> None:
+    """name.csv and name.md."""
+    with open(out / f"{name}.csv", "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows(rows)
-    lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
+    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
     for row in rows:
-        cells = (row.get(name, "") for name in COLUMNS)
+        cells = (row.get(column, "") for column in columns)
         lines.append("| " + " | ".join(f"{c:.4g}" if isinstance(c, float) else str(c) for c in cells) + " |")
-    (out / "tracking.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (out / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -135,12 +164,20 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", required=True, type=Path)
     parser.add_argument("--spoil", action="store_true", help="also the spoilt copies of the first subject")
     parser.add_argument("--cases", default="", help="only these spoilt copies, by commas")
+    parser.add_argument("--backwards", action="store_true", help="compare with the clip run backwards; no truth needed")
     options = parser.parse_args(arguments)
+    options.out.mkdir(parents=True, exist_ok=True)
+    if options.backwards:
+        rows = []
+        for subject in options.subjects:
+            rows.append(both_ways(subject.resolve(), options.out))
+            write_table(rows, options.out, "backwards", BACKWARDS_COLUMNS)
+        print((options.out / "backwards.md").read_text(encoding="utf-8"))
+        return 0
     for subject in options.subjects:
         if not (subject / "gt" / "poses.npz").exists():
             print(f"error: no ground truth: {subject}; see tools/synthesize.py", file=sys.stderr)
             return 2
-    options.out.mkdir(parents=True, exist_ok=True)
     rows = []
     for subject in options.subjects:
         rows.append(bench(subject.resolve(), subject.resolve().name, options.out / "runs"))

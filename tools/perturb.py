@@ -46,6 +46,11 @@ def _scaled(codes: np.ndarray, gain: float | np.ndarray) -> np.ndarray:
 PIXELS: dict[str, Spoil] = {"flicker": flicker, "motion_blur": motion_blur, "rolling_exposure": rolling_exposure}
 
 
+def unspoilt(codes: np.ndarray, index: int, count: int) -> np.ndarray:
+    """The frame as it is, for copies that differ in the order of their frames only."""
+    return codes
+
+
 def landmark_bias(points: np.ndarray, yaw: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Three pixels to the side that the head turns to, at its widest turn."""
     return points + (3.0 * yaw / np.abs(yaw).max())[:, None, None] * [1.0, 0.0]
@@ -113,7 +118,7 @@ def _describe(subject: Path, destination: Path, changes: dict, chosen: np.ndarra
         head = Path(content["video"]).parts[0]
         (destination / head).symlink_to((subject / head).resolve())
         (destination / "gt").symlink_to((subject / "gt").resolve())
-    else:
+    elif (subject / "gt").exists():
         (destination / "gt").mkdir()
         for file in (subject / "gt").iterdir():
             if file.name != "poses.npz":
@@ -121,5 +126,6 @@ def _describe(subject: Path, destination: Path, changes: dict, chosen: np.ndarra
         truth = load_arrays(subject / "gt" / "poses.npz")
         truth["camera_from_head"] = truth["camera_from_head"][chosen]
         save_arrays(destination / "gt" / "poses.npz", **truth)
-    (destination / "capture.json").symlink_to((subject / "capture.json").resolve())
+    if (subject / "capture.json").exists():
+        (destination / "capture.json").symlink_to((subject / "capture.json").resolve())
     (destination / "subject.yaml").write_text(yaml.safe_dump({**content, **changes}), encoding="utf-8")

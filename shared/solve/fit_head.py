@@ -52,6 +52,7 @@ class HeadFit:
 
 EFFECTIVE_TRACKS = 100.0
 SURFACE_REACH_MM = 8.0
+CONTACT_MM, CONTACT_WEIGHT, FACING_COSINE = 2.5, 1.0, -0.5
 APERTURES = np.array(
     [(160, 144), (159, 145), (158, 153), (387, 373), (386, 374), (385, 380), (82, 87), (13, 14), (312, 317)]
 )
@@ -203,11 +204,12 @@ def fit_surface(
     """The free correction: vertices move by a thin plate through the track points [N, 3] (track space).
 
     Each point pulls the place on the surface that lies under it along the normal, not the nearest vertex: between
-    vertices a curved surface sags.
+    vertices a curved surface sags. Lips that the codes have closed stay closed.
     """
     count = len(fit.vertices)
     laplacian = uniform_laplacian(model.faces, count)
     plate = (laplacian.T @ laplacian).tocsr() + 1e-4 * sparse.identity(count)
+    contact = CONTACT_WEIGHT * _contact(model, fit.vertices)
     in_head, vertices = fit.to_head(points), fit.vertices
     for step in range(iterations):
         stiffness = weights.stiffness * 4.0 ** (iterations - 1 - step)
@@ -218,9 +220,22 @@ def fit_surface(
         )
         wanted = interpolation @ (vertices - fit.vertices) + under.offset[:, None] * under.normal
         weighted = sparse.diags(under.weight) @ interpolation
-        matrix = interpolation.T @ weighted + stiffness * plate
+        matrix = interpolation.T @ weighted + stiffness * plate + contact
         vertices = fit.vertices + splu(matrix.tocsc()).solve(weighted.T @ wanted)
     return HeadFit(fit.scale, fit.rotation, fit.translation, fit.identity, fit.expression, vertices)
+
+
+def _contact(model: HeadModel, vertices: np.ndarray) -> sparse.csr_matrix:
+    """Laplacian [V, V] of the graph that joins facing vertices of the lips closer than CONTACT_MM."""
+    lips = np.unique(model.faces[model.segment("lips")])
+    normals = vertex_normals(vertices, model.faces)[lips]
+    pairs = cKDTree(vertices[lips]).query_pairs(CONTACT_MM, output_type="ndarray")
+    pairs = pairs[(normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(1) < FACING_COSINE]
+    rows = np.repeat(np.arange(len(pairs)), 2)
+    joined = sparse.csr_matrix(
+        (np.tile([1.0, -1.0], len(pairs)), (rows, lips[pairs].ravel())), (len(pairs), len(vertices))
+    )
+    return joined.T @ joined
 
 
 @dataclass(frozen=True)
