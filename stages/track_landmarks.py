@@ -17,7 +17,7 @@ from shared.contract import Job, Output, Parameter, Stage, main
 
 STAGE = Stage(
     name="track_landmarks",
-    version=2,
+    version=3,
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
     given=("landmarks", "poses"),
@@ -44,7 +44,7 @@ STAGE = Stage(
         Parameter("fit", str, "robust", "Weights of the head fit.", choices=("robust", "published")),
         Parameter("stiffness", float, 0.25, "Resistance of the free shape correction to bending.", "", 0.01, 1e6),
         Parameter("least_presence", float, 0.5, "Landmark network's confidence below which a frame is lost.", "", 0, 1),
-        Parameter("largest_error", float, 1.5, "Median track error beyond which a frame is excluded.", "px", 0.1, 50.0),
+        Parameter("outlier_factor", float, 4.0, "Frames that fit so many times worse are left out.", "", 1.5, 100.0),
     ),
 )
 
@@ -181,7 +181,7 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
     from shared.solve.judge_track import judge_frames
     from shared.tracking_pictures import pose_curves, residual_map
 
-    fits, reasons = judge_frames(track, job.params.largest_error)
+    fits, reasons = judge_frames(track, job.params.outlier_factor)
     kept, poses, covariance = used[fits], track.camera_from_head[fits], track.covariance[fits]
     gain = track.focal_gain if track.focal_solved else 1.0
     lens = zoomed(frames.intrinsics, gain)

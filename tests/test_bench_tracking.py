@@ -8,7 +8,7 @@ import yaml
 
 from shared.contract.subject import load_subject
 from shared.io.arrays import load_arrays
-from shared.io.images import read_png
+from shared.io.images import read_png, write_png
 from tools import perturb
 from tools.bench_tracking import COLUMNS, main, measure, write_table
 from tools.goldens import TINY_SUBJECT
@@ -111,3 +111,17 @@ def test_a_subject_without_truth_is_refused(tmp_path, capsys):
     assert main([str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "no ground truth" in capsys.readouterr().err
     assert not Path(tmp_path / "out").exists()
+
+
+def test_a_clip_without_truth_can_be_run_backwards(tmp_path):
+    subject = tmp_path / "plain"
+    subject.mkdir()
+    frames = np.random.default_rng(0).integers(0, 255, (4, 16, 24, 3), np.uint8)
+    (subject / "frames").mkdir()
+    for number, frame in enumerate(frames):
+        write_png(subject / "frames" / f"{number:04d}.png", frame)
+    (subject / "subject.yaml").write_text("video: frames/%04d.png\n")
+    perturb.spoil_pixels(subject, tmp_path / "copy", perturb.unspoilt, slice(None, None, -1))
+    for number, frame in enumerate(frames[::-1]):
+        assert (read_png(tmp_path / "copy" / "frames" / f"{number:04d}.png") == frame).all()
+    assert not (tmp_path / "copy" / "gt").exists()

@@ -166,8 +166,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--cases", default="", help="only these spoilt copies, by commas")
     parser.add_argument("--backwards", action="store_true", help="compare with the clip run backwards; no truth needed")
     options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
     if options.backwards:
+        options.out.mkdir(parents=True, exist_ok=True)
         rows = []
         for subject in options.subjects:
             rows.append(both_ways(subject.resolve(), options.out))
@@ -178,6 +178,7 @@ def main(arguments: list[str] | None = None) -> int:
         if not (subject / "gt" / "poses.npz").exists():
             print(f"error: no ground truth: {subject}; see tools/synthesize.py", file=sys.stderr)
             return 2
+    options.out.mkdir(parents=True, exist_ok=True)
     rows = []
     for subject in options.subjects:
         rows.append(bench(subject.resolve(), subject.resolve().name, options.out / "runs"))

@@ -227,7 +227,7 @@ def fit_surface(
 
 def _contact(model: HeadModel, vertices: np.ndarray) -> sparse.csr_matrix:
     """Laplacian [V, V] of the graph that joins facing vertices of the lips closer than CONTACT_MM."""
-    lips = np.unique(model.faces[model.segment("lips")])
+    lips = np.unique(model.faces[np.array([name == "lips" for name in model.segment_names])[model.face_segment]])
     normals = vertex_normals(vertices, model.faces)[lips]
     pairs = cKDTree(vertices[lips]).query_pairs(CONTACT_MM, output_type="ndarray")
     pairs = pairs[(normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(1) < FACING_COSINE]

@@ -14,14 +14,17 @@ FOCAL_TOLERANCE = 0.03
 MOUTH_RATIO = 2.0
 """Tracks around the mouth that fit so many times worse than the rest mean talk or a smile that comes and goes."""
 
-OUTLIER_FACTOR = 4.0
+LEAST_OUTLIER_PX = 0.25
 
 
-def judge_frames(track: HeadTrack, largest_error_px: float) -> tuple[np.ndarray, list[str]]:
-    """Which of the tracked frames fit [U] bool, and why each of the others does not ('' where it fits)."""
+def judge_frames(track: HeadTrack, outlier_factor: float) -> tuple[np.ndarray, list[str]]:
+    """Which of the tracked frames fit [U] bool, and why each of the others does not ('' where it fits).
+
+    A frame whose median track error is outlier_factor times the clip's, and LEAST_OUTLIER_PX at least, does not.
+    """
     error = np.full(len(track.reliable), np.nan)
     error[track.reliable] = np.nanmedian(track.error_px[track.reliable], axis=1)
-    limit = max(largest_error_px, OUTLIER_FACTOR * float(np.nanmedian(error)))
+    limit = max(outlier_factor * float(np.nanmedian(error)), LEAST_OUTLIER_PX)
     reasons = []
     for reliable, frame_error in zip(track.reliable, error, strict=True):
         if not reliable:

@@ -153,13 +153,17 @@ def track_texture(
 def solve_texture(
     clip: TrackedClip, tracks: Tracks, points: np.ndarray, poses: np.ndarray, prior_mm: float
 ) -> Adjusted:
-    """Rigid adjustment; then the noise is set to what was left over, and tracks that fit badly weigh less."""
+    """Rigid adjustment; then the noise is set to what was left over: tracks and frames that fit badly weigh less."""
     tracks, points, reliable = enough_observations(tracks, points)
     for _ in range(2):
         solved = adjust_clip(clip, tracks.subset(reliable), poses[reliable], points, prior_mm)
         whitened = np.einsum("fnij,fnj->fni", tracks.whitening[reliable], solved.residuals_px)
         of_track = 1.4826 * np.nanmedian(np.abs(whitened), axis=(0, 2))
-        tracks = Tracks(tracks.pixels, tracks.whitening / np.maximum(of_track, 0.3)[:, None, None])
+        of_frame = np.ones(len(reliable))
+        of_frame[reliable] = 1.4826 * np.nanmedian(np.abs(whitened), axis=(1, 2))
+        worse = np.maximum(of_frame / np.median(of_frame[reliable]), 1.0)
+        noise = np.maximum(of_track, 0.3) * worse[:, None]
+        tracks = Tracks(tracks.pixels, tracks.whitening / noise[..., None, None])
         poses = np.array(poses)
         poses[reliable], points = solved.camera_from_points, solved.points
     error = np.nanmedian(solved.error_px, axis=0)

@@ -13,9 +13,10 @@ import numpy as np
 
 from shared.bundle import BundleSolution, place_points, zoomed
 from shared.bundle_problem import Tracks
-from shared.geometry import camera_centres, rigid
+from shared.geometry import camera_centres, project, rigid
 from shared.head_model import HeadModel
 from shared.mesh import normalised
+from shared.pnp import pose_from_points
 from shared.solve.first_poses import (
     LOSS,
     Adjusted,
@@ -33,6 +34,12 @@ from shared.texture_tracks import Windows
 
 LANDMARK_FRAMES = 15
 """Landmarks are taken from so many frames around the middle of the motion."""
+
+FOLLOW_TEXELS = 3.0
+"""Half of what the coarse pass searches; landmarks jitter by less."""
+
+LANDMARK_REACH = 0.08
+"""Landmarks off by more than this share of the face's width don't count."""
 
 HELD_OUT_EVERY = 8
 """One fine track in so many is held out to judge the poses."""
@@ -90,7 +97,7 @@ def track_head(
     note(_summary("flow over the head", found))
 
     fit = _fit(few, model, found, settings)
-    poses, known = _onto_all(clip, chosen, fit, found)
+    poses, known = _onto_all(clip, model, chosen, fit, found)
     found = _texture_pass(clip, model, fit, poses, known, coarse_pass(clip.face_width_px), progress)
     note(_summary("tracks", found))
     fine = TexturePass(
@@ -127,14 +134,46 @@ def track_head(
     )
 
 
-def _onto_all(clip, chosen, fit, found) -> tuple[np.ndarray, np.ndarray]:
+def _onto_all(clip, model, chosen, fit, found) -> tuple[np.ndarray, np.ndarray]:
     """Poses of all frames from those of the chosen, and which of them are known [F] bool."""
     poses = fit.camera_from_head(found.solution.camera_from_points)
     if clip.hold_poses:
         return carried_poses(clip.given_poses, clip.given_poses[chosen], poses), np.ones(clip.count, bool)
     known = np.zeros(clip.count, bool)
     known[chosen[found.reliable]] = True
-    return interpolate_poses(poses[found.reliable], clip.time_s[known], clip.time_s), known
+    named = model.landmarks(fit.vertices)
+    named[(model.landmark_face < 0) | (model.landmark_weight <= 0)] = np.nan
+    return follow_landmarks(clip, named, poses[found.reliable], known), known
+
+
+def follow_landmarks(clip: TrackedClip, named: np.ndarray, poses: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Poses [F, 4, 4] of all frames from those [K, 4, 4] of the frames `known` [F] bool.
+
+    Between known frames motion is interpolated. Where a frame's landmarks say that the head was elsewhere by more than
+    FOLLOW_TEXELS of the coarse pass, its pose is theirs instead, with their bias as it is in the known frames around:
+    a head that starts or stops at once leaves the interpolation's path by more than tracks can be searched.
+    named [468, 3]: landmarks on the head, NaN where the model has none.
+    """
+    between = interpolate_poses(poses, clip.time_s[known], clip.time_s)
+    usable = np.isfinite(named[:, 0])
+    reach_px = LANDMARK_REACH * clip.face_width_px
+    limit_px = FOLLOW_TEXELS * coarse_pass(clip.face_width_px).texel_px
+    seen = [
+        pose_from_points(named[usable], frame[usable], clip.intrinsics, clip.size, reach_px)
+        for frame in clip.landmarks_px
+    ]
+    both = known & np.array([pose is not None for pose in seen])
+    if not both.any():
+        return between
+    bias = np.stack([np.linalg.inv(seen[i]) @ between[i] for i in np.nonzero(both)[0]])
+    bias = interpolate_poses(bias, clip.time_s[both], clip.time_s)
+    for i in np.nonzero(~known)[0]:
+        if seen[i] is not None:
+            followed = seen[i] @ bias[i]
+            pixels = project(named[usable], np.stack([between[i], followed]), clip.intrinsics)[0]
+            if np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)) > limit_px:
+                between[i] = followed
+    return between
 
 
 def carried_poses(poses: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
