@@ -11,7 +11,7 @@ from shared.raycast import RayScene, camera_hits
 from shared.solve.inverse import make_maps
 from shared.solve.texture import Noise, NormalEquations, pooled_specular, robust_weight
 from shared.solve.texture_pass import Clip, TexturePass
-from shared.texels import TexelSamples, TexelSurface, harmonic_fill
+from shared.texels import TexelSamples, TexelSurface, smooth_field
 from shared.texture import sample_bilinear
 
 NOISE = Noise(0.01, 0.02)
@@ -117,21 +117,29 @@ def test_robust_weights():
     assert (guessed[3] > 3.0 * told[3]).all(), "a model that knows nothing does not overrule a sample"
 
 
-def test_fill_is_harmonic():
-    """A linear ramp known on the rim of a square is continued inside; two loose parts take the median."""
+def test_field_continues_what_is_known_and_sinks_to_the_mean():
+    """A linear ramp known on the rim of a square goes on inside; a loose part of which nothing is known is the mean."""
     plate = grid_plane(17, 1.0)
     x, y = plate.uvs.T
     values = np.stack([x + 2 * y, 3 - x], axis=1)
-    rim = (np.abs(plate.uvs - 0.5).max(1) > 0.49)[:, None]
-    found = harmonic_fill(plate, np.where(rim, values, 0.0), np.repeat(rim, 2, axis=1))
+    rim = np.repeat((np.abs(plate.uvs - 0.5).max(1) > 0.49)[:, None], 2, axis=1)
+    mean = np.array([0.3, -0.2])
+    found = smooth_field(plate, np.where(rim, values, 0.0), 1e6 * rim, mean, 0.05, 100.0)
     assert np.allclose(found, values, atol=0.03)
     loose = plate.replace(
         vertices=np.concatenate([plate.vertices, plate.vertices + 5.0]),
         faces=np.concatenate([plate.faces, plate.faces + len(x)]),
     )
-    known = np.concatenate([np.ones(len(x), bool), np.zeros(len(x), bool)])[:, None]
-    both = harmonic_fill(loose, np.concatenate([values, values])[:, :1], known)
-    assert np.allclose(both[len(x) :], np.median(values[:, 0]), atol=1e-6)
+    known = np.repeat([[1.0, 1.0], [0.0, 0.0]], len(x), axis=0)
+    both = smooth_field(loose, np.tile(values, (2, 1)), known, mean, 0.05, 1.0)
+    assert np.allclose(both[len(x) :], mean, atol=1e-6)
+
+
+def test_field_weighs_values_by_their_precision():
+    """One vertex against the mean: the posterior mean of two normal distributions."""
+    plate = grid_plane(2, 1.0)
+    found = smooth_field(plate, np.full((4, 1), 2.0), np.full((4, 1), 3.0), np.array([0.0]), 0.05, 0.5)
+    assert np.allclose(found, 2.0 * 3.0 / (3.0 + 4.0), atol=1e-9)
 
 
 # ---------------------------------------------------------------------- the whole pass

@@ -124,12 +124,24 @@ def _albedo_errors(truth: np.ndarray, found: np.ndarray, confidence: np.ndarray)
         for low, inside in zip(edges[:-1], bins, strict=True)
     ]
     return {
+        **_confident_errors(truth, found, confidence > CONFIDENT),
         "delta_e2000_median": float(np.median(aligned)),
         "delta_e2000_p90": float(np.percentile(aligned, 90)),
         "delta_e2000_raw_median": float(np.median(raw)),
         "psnr_linear": score_measures.psnr(truth, found * gain),
         "gain": [round(float(value), 4) for value in gain],
         "calibration": calibration,
+    }
+
+
+def _confident_errors(truth: np.ndarray, found: np.ndarray, sure: np.ndarray) -> dict:
+    """Where the clip saw light, with gains from there: what it did not see must not set them."""
+    truth, found = truth[sure].astype(np.float64), found[sure]
+    found = found * score_measures.channel_gain(truth, found)
+    apart = delta_e_2000(np.clip(truth, 0, None), np.clip(found, 0, None))
+    return {
+        "confident_delta_e2000_median": float(np.median(apart)),
+        "confident_psnr_linear": score_measures.psnr(truth, found),
     }
 
 

@@ -19,9 +19,11 @@ from shared.solve.texture import (
     pooled_specular,
     robust_weight,
 )
-from shared.texels import TexelSamples, TexelSurface, harmonic_fill
+from shared.texels import TexelSamples, TexelSurface, smooth_field
 
 _ALBEDO_PULL = 10.0
+NEIGHBOUR_STEP, SURROUNDINGS_SPREAD = 0.05, 1.0
+"""Standard deviations of the log albedo: from one vertex to the next, and from the person's typical skin."""
 FIRST_PASS_FRAMES = 32
 """Enough to tell what a texel looks like, so that every frame's samples can be weighed by it."""
 
@@ -105,15 +107,23 @@ class TexturePass:
         information = equations.information(self.typical_albedo, self.systematic)
         rough = equations.solve_albedo(specular, np.zeros_like(equations.ee), 1e-6)
         certain = information / (1.0 + information)
-        known, total = self.surface.to_vertices(rough, certain)
-        smooth = harmonic_fill(self.surface.mesh, known, total > 0.5)
-        smooth = np.maximum(self.surface.interpolate(smooth.astype(np.float32)), 1e-3)
+        smooth = np.exp(self.surface.interpolate(self._surroundings(rough, information).astype(np.float32)))
         # A texel's brightness by its certain channels, its colour otherwise the neighbourhood's.
         brighter = (certain * np.log(np.maximum(rough, 1e-3) / smooth)).sum(1) / (certain.sum(1) + 0.3)
         brighter *= (PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + self.systematic)).mean(1)
         pull = _ALBEDO_PULL + equations.ee * (self.systematic / PRIOR_SPREAD**2)
         albedo = equations.solve_albedo(specular, smooth * np.exp(brighter)[:, None], pull)
         return TexelMaterial(albedo, specular, information.min(1))
+
+    def _surroundings(self, rough: np.ndarray, information: np.ndarray) -> np.ndarray:
+        """[V, 3] log albedo as a smooth field: texels that the clip tells little of follow those that it knows."""
+        precision = np.minimum(information, NEIGHBOUR_STEP**-2)
+        log_albedo, total = self.surface.to_vertices(np.log(np.maximum(rough, 1e-3)), precision)
+        share, _ = self.surface.to_vertices(precision, np.ones_like(precision))
+        mean = np.log(np.maximum(self.typical_albedo, 1e-3))
+        # What leaves a texel as open as the prior does is mostly a model's error that its neighbours share.
+        known = np.where(total > 0.0, share**2 / (share + PRIOR_SPREAD**-2), 0.0)
+        return smooth_field(self.surface.mesh, log_albedo, known, mean, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD)
 
     def held_out_errors(self, candidates: list[TexelMaterial]) -> list[float]:
         """Root mean square residual of each candidate on the held-out frames (linear, censored, trust-weighted)."""
