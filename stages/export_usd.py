@@ -1,9 +1,10 @@
 """The result as files that other programs open, and a page on which a person judges it.
 
-Reads    sample_frames: frames.json and the chosen frames (for the report). track_landmarks: tracking.json and
-         overlay.png. init_albedo: its record. inverse_render: maps, envmap.exr, mesh.npz, poses.npz, renders,
+Reads    sample_frames: frames.json and the frames (for the plates and the report). track_landmarks: tracking.json
+         and overlay.png. init_albedo: its record. inverse_render: maps, envmap.exr, mesh.npz, poses.npz, renders,
          solve.json. Of all of them manifest.json and provenance.json.
-Writes   head.usda, head.usdz, mesh.obj, maps/*.exr, envmap.exr, poses.npz, renders/*.exr, run.json, report.html.
+Writes   head.usda with its payload, head.usdz, head.glb, mesh.obj, maps/*.exr, envmap.exr, poses.npz, plates/*.jpg,
+         renders/*.exr, run.json, report.html.
 Method   Units, axes, colour spaces and sources are stated on everything that is written; then the asset is validated
          as a stranger would find it on disk.
 Fails    values that are not finite, a mesh with broken indices or UVs, a map that is not a square power of two,
@@ -20,26 +21,37 @@ from shared.errors import LimnError
 
 STAGE = Stage(
     name="export_usd",
-    version=1,
-    help="The head as USD, OBJ and EXR, with a report to judge it by.",
+    version=2,
+    help="The head as USD, glTF, OBJ and EXR, with a report to judge it by.",
     inputs=("sample_frames", "track_landmarks", "init_albedo", "inverse_render"),
     outputs=(
-        Output("head.usda", "mesh, materials, light, camera and motion", unit="mm", space="world"),
-        Output("head.usdz", "head.usda and its textures in one file; absent when usdz is off", optional=True),
+        Output("head.usda", "light, camera and motion; loads the next three", unit="mm", space="world"),
+        Output("head_payload.usda", "payload of head.usda: joins the next two"),
+        Output("head_geo.usdc", "the mesh", unit="mm", space="head"),
+        Output("head_mtl.usda", "the materials"),
+        Output("head.usdz", "all of head.usda and its textures in one file; absent when usdz is off", optional=True),
+        Output("head.glb", "mesh, textures, lens and motion as binary glTF; absent when glb is off", unit="m",
+               optional=True),
         Output("mesh.obj", "the mesh with its UVs", unit="mm", space="head"),
         Output("maps/*.exr", "texture maps, v up", space="uv", colour_space="in each file"),
         Output("maps/png/*.png", "integer copies of the maps; absent unless png_copies", space="uv", optional=True),
         Output("envmap.exr", "the light, lat-long", space="world", colour_space="in the file"),
         Output("poses.npz", "camera_from_head [F, 4, 4], frame_index [F], intrinsics [3, 3] of the frame", "mm"),
+        Output("plates/*.jpg", "the clip's crops, sRGB; absent when plates is off", space="crop", optional=True),
         Output("renders/*.exr", "re-renders in full source frames", colour_space="in each file"),
         Output("run.json", "parameters, model, costs, residuals and warnings of all stages", volatile=True),
         Output("report.html", "the page for people", volatile=True),
     ),
     parameters=(
         Parameter("map_format", str, "half", "Precision of the EXR files.", choices=("half", "float")),
+        Parameter("map_layout", str, "scanline", "How the maps' EXR files are laid out; mipmap includes tiles.",
+                  choices=("scanline", "tiled", "mipmap")),
+        Parameter("udim", bool, False, "Name the maps as tile 1001 of a UDIM set."),
         Parameter("acescg", bool, False, "Write colours as ACEScg instead of linear Rec.709."),
         Parameter("png_copies", str, "none", "Also write the maps as PNG.", choices=("none", "8", "16"), unit="bits"),
         Parameter("usdz", bool, True, "Also pack everything into head.usdz."),
+        Parameter("glb", bool, True, "Also write binary glTF."),
+        Parameter("plates", bool, True, "Also write the clip's frames, shown behind the head in USD as a guide."),
         Parameter("report_frames", int, 12, "Frames that the report compares.", unit="frames", minimum=1, maximum=60),
     ),
 )
@@ -48,29 +60,28 @@ SMALLEST_HEAD_MM, LARGEST_HEAD_MM = 100.0, 800.0
 
 
 def read_maps(folder: Path) -> dict:
-    """{name: array} of inverse_render's maps; confidence clipped to [0, 1]."""
+    """{name: array} of inverse_render's maps and of what follows from them; confidence clipped to [0, 1]."""
     import numpy as np
 
-    from shared.io.export_maps import MAPS
+    from shared.io.export_maps import SOLVED_MAPS
     from shared.io.images import read_exr
+    from shared.io.usd_material import modulated_ior
 
-    maps = {name: read_exr(folder / f"{name}.exr") for name in MAPS}
+    maps = {name: read_exr(folder / f"{name}.exr") for name in SOLVED_MAPS}
     maps["confidence"] = np.clip(maps["confidence"], 0.0, 1.0)
-    return maps
+    return maps | {"specular_ior": modulated_ior(maps["specular_intensity"])}
 
 
 def write_images(job: Job, writer, maps: dict, envmap, frames, render_frames: list[int]) -> None:
     """maps/, envmap.exr and renders/ in the chosen precision and colour space."""
-    from shared.io.export_maps import paste_crop, write_png_copies
+    from shared.io.export_maps import SOLVED_MAPS, paste_crop, write_png_copies
     from shared.io.images import read_exr
-    from shared.io.usd_material import modulated_ior
 
     writer.write_maps(job.out / "maps", maps)
-    ior = modulated_ior(maps["specular_intensity"])
-    writer.write_data(job.out / "maps" / "specular_ior.exr", ior, "index of refraction, for UsdPreviewSurface")
     writer.write_colour(job.out / "envmap.exr", envmap, "radiance, clip maximum 1", latlong=True)
     if job.params.png_copies != "none":
-        write_png_copies(job.out / "maps" / "png", maps, int(job.params.png_copies))
+        solved = {name: maps[name] for name in SOLVED_MAPS}
+        write_png_copies(job.out / "maps" / "png", solved, int(job.params.png_copies))
     (job.out / "renders").mkdir()
     for frame_index in job.progress(render_frames, "renders"):
         crop = read_exr(job.input("inverse_render") / "renders" / f"{frame_index:06d}.exr")
@@ -78,37 +89,59 @@ def write_images(job: Job, writer, maps: dict, envmap, frames, render_frames: li
         writer.write_colour(job.out / "renders" / f"{frame_index:04d}.exr", full, "radiance, clip maximum 1")
 
 
-def write_geometry(job: Job, mesh, poses: dict, frames, colour_space: str) -> None:
-    """mesh.obj, poses.npz, head.usda and, when wished, head.usdz."""
-    from shared.io.arrays import save_arrays
-    from shared.io.export_maps import MAPS
-    from shared.io.meshes import write_obj
-    from shared.io.usd import HeadAsset, write_head_usda
+def describe_capture(job: Job, poses: dict, frames):
+    """Lens, film back and motion of the clip."""
     from shared.io.usd_capture import DEFAULT_FILM_WIDTH_MM, Capture
-    from shared.io.usdz import write_usdz
 
-    write_obj(job.out / "mesh.obj", mesh)
-    intrinsics = poses["intrinsics"]
-    kept = {name: poses[name] for name in ("camera_from_head", "frame_index")}
-    save_arrays(job.out / "poses.npz", intrinsics=intrinsics, **kept)
     width, height = frames.source_size
-    film_width = job.subject.sensor_width_mm or DEFAULT_FILM_WIDTH_MM
-    capture = Capture(**kept, fps=frames.fps, intrinsics=intrinsics, width=width, height=height, moves=frames.moves,
-                      film_width_mm=film_width)
-    maps = {name: f"./maps/{name}.exr" for name in (*MAPS, "specular_ior")}
+    intrinsics, film_width = poses["intrinsics"], job.subject.sensor_width_mm or DEFAULT_FILM_WIDTH_MM
+    if job.subject.sensor_width_mm is not None and job.subject.focal_length_mm is not None:
+        film_width = job.subject.focal_length_mm * width / float(intrinsics[0, 0])  # right for turned clips too
+    return Capture(poses["camera_from_head"], poses["frame_index"], fps=frames.fps, intrinsics=intrinsics, width=width,
+                   height=height, moves=frames.moves, film_width_mm=film_width)
+
+
+def describe_asset(job: Job, mesh, capture, frames, writer):
+    """The asset that head.usda and head.usdz hold; writes the plates."""
+    from shared.io.plates import crop_rectangle, write_plates
+    from shared.io.usd import HeadAsset
+    from shared.io.usd_capture import Plate
+    from shared.io.usd_material import SHADER_INPUTS, Texture
+
+    plate = None
+    if job.params.plates:
+        shown = write_plates(job.out / "plates", frames, capture.frame_index, lambda all: job.progress(all, "plates"))
+        plate = Plate({frame: f"./plates/{name}" for frame, name in shown.items()}, crop_rectangle(frames))
+    spaces = {"diffuse_albedo": writer.colour_space}
+    maps = {name: Texture(f"./maps/{writer.file_name(name)}", spaces.get(name, "data")) for name in SHADER_INPUTS}
     metadata = {
-        "clip": {"name": frames.source_name, "width": width, "height": height, "fps": frames.fps},
+        "clip": {"name": frames.source_name, "width": capture.width, "height": capture.height, "fps": frames.fps},
         "moves": frames.moves,
         "focal_length_known": bool(frames.focal_known),
         "film_width_known": job.subject.sensor_width_mm is not None,
         "brdf": "albedo / pi + specular_intensity * GGX (Smith, Schlick F0 = 0.04, alpha = roughness^2)",
-        "confidence_map": "maps/confidence.exr",
+        "confidence_map": f"maps/{writer.file_name('confidence')}",
     }
-    asset = HeadAsset(job.subject.name, mesh, maps, "./envmap.exr", capture, version=str(STAGE.version),
-                      colour_space=colour_space, metadata=metadata)
-    write_head_usda(job.out / "head.usda", asset)
+    light = Texture("./envmap.exr", writer.colour_space)
+    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, version=str(STAGE.version), metadata=metadata)
+
+
+def write_assets(job: Job, asset, poses: dict, maps: dict, envmap) -> None:
+    """mesh.obj, poses.npz, head.usda and its layers; when wished, head.usdz and head.glb."""
+    from shared.io.arrays import save_arrays
+    from shared.io.gltf import write_glb
+    from shared.io.meshes import write_obj
+    from shared.io.usd import write_head_usda
+    from shared.io.usdz import write_head_usdz
+
+    write_obj(job.out / "mesh.obj", asset.mesh)
+    kept = {name: poses[name] for name in ("camera_from_head", "frame_index", "intrinsics")}
+    save_arrays(job.out / "poses.npz", **kept)
+    write_head_usda(job.out, asset)
     if job.params.usdz:
-        write_usdz(job.out / "head.usdz", job.out / "head.usda")
+        write_head_usdz(job.out / "head.usdz", asset, maps, envmap)
+    if job.params.glb:
+        write_glb(job.out / "head.glb", asset.name, asset.mesh, maps, asset.capture)
 
 
 def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
@@ -149,9 +182,11 @@ def run(job: Job) -> None:
     mesh, poses = load_mesh(solved / "mesh.npz"), load_arrays(solved / "poses.npz")
     solve, maps, envmap = read_json(solved / "solve.json"), read_maps(solved / "maps"), read_exr(solved / "envmap.exr")
     source = {"stage": STAGE.name, "stage_version": STAGE.version, "source": "inverse_render"}
-    writer = MapWriter(job.params.map_format == "half", job.params.acescg, source)
+    params = job.params
+    writer = MapWriter(params.map_format == "half", params.acescg, source, params.map_layout, params.udim)
     write_images(job, writer, maps, envmap, frames, solve["render_frames"])
-    write_geometry(job, mesh, poses, frames, writer.colour_space)
+    asset = describe_asset(job, mesh, describe_capture(job, poses, frames), frames, writer)
+    write_assets(job, asset, poses, maps, envmap)
     record = run_record(job, mesh, solve, time.perf_counter() - start)
     write_json(job.out / "run.json", record)
     folders = {name: job.input(name) for name in STAGE.inputs}
@@ -166,10 +201,10 @@ def check(job: Job) -> None:
     import numpy as np
 
     from shared.io.arrays import load_arrays
-    from shared.io.export_maps import MAPS
+    from shared.io.export_maps import MAPS, UDIM_TILE
     from shared.io.images import read_exr
     from shared.io.meshes import read_obj
-    from shared.io.usd_validate import usd_errors
+    from shared.io.usd_validate import package_errors, usd_errors
     from shared.mesh_checks import mesh_errors
 
     mesh = read_obj(job.out / "mesh.obj")
@@ -177,14 +212,15 @@ def check(job: Job) -> None:
     size = float(np.ptp(mesh.vertices, axis=0).max())
     if not SMALLEST_HEAD_MM < size < LARGEST_HEAD_MM:
         errors.append(f"mesh.obj: {size:.0f} mm is not the size of a head")
-    for name in (*MAPS, "specular_ior"):
-        errors += map_errors(name, read_exr(job.out / "maps" / f"{name}.exr"))
+    for name in MAPS:
+        file = f"{name}.{UDIM_TILE}.exr" if job.params.udim else f"{name}.exr"
+        errors += map_errors(name, read_exr(job.out / "maps" / file))
     rotations = load_arrays(job.out / "poses.npz")["camera_from_head"][:, :3, :3]
     if not np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-6):
         errors.append("poses.npz: not all poses are rigid")
     errors += usd_errors(job.out / "head.usda")
     if job.params.usdz:
-        errors += usd_errors(job.out / "head.usdz")
+        errors += usd_errors(job.out / "head.usdz") + package_errors(job.out / "head.usdz")
     if errors:
         raise LimnError("the result does not pass its checks: " + "; ".join(errors))
 

@@ -1,14 +1,19 @@
 """The exported files, read back by USD, OpenEXR and zip as another program would."""
 
 import os
+import shutil
+import subprocess
 import zipfile
 
+import cv2
 import numpy as np
 import OpenEXR
+import OpenImageIO
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 from toy_result import (
     CROP,
+    CROP_SIZE,
     FRAMES,
     INTRINSICS,
     MAP_SIZE,
@@ -21,16 +26,17 @@ from toy_result import (
     write_toy_work,
 )
 
+from shared.color import encode_srgb
 from shared.errors import LimnError
 from shared.geometry import project, world_from_head
 from shared.io.arrays import load_arrays, read_json
-from shared.io.export_maps import acescg_from_rec709, paste_crop
+from shared.io.export_maps import MAPS, acescg_from_rec709, paste_crop
 from shared.io.images import read_exr, read_png, write_exr
 from shared.io.meshes import read_obj
 from shared.io.usd import VARIANT_SET, VARIANT_STILL, prim_name
 from shared.io.usd_capture import Capture
 from shared.io.usd_material import modulated_ior
-from shared.io.usd_validate import usd_errors
+from shared.io.usd_validate import package_errors, usd_errors
 from shared.io.usdz import write_usdz
 from shared.mesh import Mesh, vertex_normals
 from shared.mesh_checks import mesh_errors, mesh_warnings
@@ -89,10 +95,11 @@ def test_prim_name_is_valid_and_readable(name, expected):
 
 def test_every_file_of_the_contract_is_there(exported):
     files = {path.relative_to(exported["head"]).as_posix() for path in exported["head"].rglob("*") if path.is_file()}
-    maps = {f"maps/{name}.exr" for name in (*toy_maps(), "specular_ior")}
-    renders = {f"renders/{frame:04d}.exr" for frame in RENDERED}
-    single = {"head.usda", "head.usdz", "mesh.obj", "envmap.exr", "poses.npz", "run.json", "report.html"}
-    assert files == maps | renders | single
+    maps = {f"maps/{name}.exr" for name in MAPS}
+    pictures = {f"renders/{frame:04d}.exr" for frame in RENDERED} | {f"plates/{frame:04d}.jpg" for frame in FRAMES}
+    layers = {"head.usda", "head_payload.usda", "head_geo.usdc", "head_mtl.usda", "head.usdz", "head.glb"}
+    single = {"mesh.obj", "envmap.exr", "poses.npz", "run.json", "report.html"}
+    assert files == maps | pictures | layers | single
     assert all(export_usd.STAGE.output_of(file) for file in files)
 
 
@@ -105,8 +112,56 @@ def test_layer_says_what_studios_ask_for(stage):
     assert stage.GetTimeCodesPerSecond() == 25.0
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (FRAMES[0], FRAMES[-1])
     assert root.GetPrimAtPath("geo").IsA(UsdGeom.Scope) and root.GetPrimAtPath("mtl").IsA(UsdGeom.Scope)
+    assert root.GetInherits().GetAllDirectInherits() == [Sdf.Path("/__class__/_1st_Zoe_take_ete")]
     facts = root.GetCustomDataByKey("limn")
     assert facts["subject"] == NAME and facts["clip"]["name"] == 'a "clip".mp4'
+
+
+def test_interface_stands_without_its_payload(exported):
+    """Unloaded, the asset still has its place, its extents over the whole motion, camera, light and motion."""
+    path = str(exported["head"] / "head.usda")
+    unloaded, loaded = Usd.Stage.Open(path, Usd.Stage.LoadNone), Usd.Stage.Open(path)
+    root = unloaded.GetDefaultPrim()
+    assert not root.GetPrimAtPath("geo/head").IsA(UsdGeom.Mesh) and root.GetPrimAtPath("capture/camera")
+    assert [asset.path for asset in Usd.ModelAPI(root).GetPayloadAssetDependencies()] == ["./head_payload.usda"]
+    low, high = np.array(UsdGeom.ModelAPI(root).GetExtentsHint())
+    mesh = UsdGeom.Imageable(loaded.GetDefaultPrim().GetPrimAtPath("geo/head"))
+    for frame in FRAMES:
+        world_from_head = np.array(mesh.ComputeLocalToWorldTransform(float(frame))).T
+        moved = toy_mesh().vertices @ world_from_head[:3, :3].T + world_from_head[:3, 3]
+        assert (moved >= low - 1e-3).all() and (moved <= high + 1e-3).all()
+    assert (high - low < 2.0 * np.ptp(toy_mesh().vertices, axis=0)).all()
+
+
+@pytest.mark.parametrize("moves", ["head", "camera"])
+def test_plate_fills_the_crop_in_the_cameras_view(exported, moves):
+    """The clip's card projects onto the crop's rectangle in every frame, behind the head, and shows that frame."""
+    stage = Usd.Stage.Open(str(exported[moves] / "head.usda"))
+    root = stage.GetDefaultPrim()
+    card, camera = UsdGeom.Mesh(root.GetPrimAtPath("capture/plate/card")), root.GetPrimAtPath("capture/camera")
+    assert UsdGeom.Imageable(card).ComputePurpose() == "guide"
+    x0, y0, scale = CROP
+    edges = [[x0, y0 + CROP_SIZE[1] / scale], [x0 + CROP_SIZE[0] / scale, y0]]
+    picture = UsdShade.Shader(root.GetPrimAtPath("capture/plate/material/picture"))
+    for frame in FRAMES:
+        frustum = UsdGeom.Camera(camera).GetCamera(float(frame)).frustum
+        world = UsdGeom.Imageable(card).ComputeLocalToWorldTransform(float(frame))
+        clip_from_card = world * frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
+        seen = np.array([clip_from_card.Transform(Gf.Vec3d(*point)) for point in card.GetPointsAttr().Get()])
+        pixels = (seen[:, :2] * [0.5, -0.5] + 0.5) * SOURCE_SIZE
+        np.testing.assert_allclose(pixels[[0, 2]], edges, atol=1e-2)
+        file = picture.GetInput("file").Get(float(frame)).path
+        assert file == f"./plates/{frame:04d}.jpg" and (exported[moves] / file).is_file()
+
+
+def test_plates_show_the_frames(exported, work):
+    """8-bit sRGB crops, here the clip's own codes but for the JPEG's loss."""
+    place = list(FRAMES).index(8)
+    clip = read_png(work["head"] / "sample_frames" / "frames" / f"{place:06d}.png")
+    plate = cv2.imread(str(exported["head"] / "plates" / "0008.jpg"))[..., ::-1]
+    assert plate.shape == clip.shape
+    smooth = [cv2.blur(picture, (9, 9)).astype(float) for picture in (plate, clip)]
+    assert np.abs(smooth[0] - smooth[1]).mean() < 4.0
 
 
 def test_mesh_reads_back(stage):
@@ -226,7 +281,7 @@ def break_index(stage):
 
 
 def break_normal_map(stage):
-    shader(stage, "preview_normal").GetPrim().RemoveProperty("inputs:scale")
+    shader(stage, "preview_normal").GetInput("scale").GetAttr().Block()
 
 
 def break_node(stage):
@@ -265,35 +320,56 @@ def break_uvs(stage):
 def test_damaged_assets_are_told(exported, tmp_path, damage, words):
     stage = Usd.Stage.Open(str(exported["head"] / "head.usda"), Usd.Stage.LoadAll)
     damage(stage)
-    for name in ("maps", "envmap.exr"):
+    for name in ("maps", "plates", "envmap.exr", "head_payload.usda", "head_geo.usdc", "head_mtl.usda"):
         (tmp_path / name).symlink_to(exported["head"] / name)
     stage.GetRootLayer().Export(str(tmp_path / "head.usda"))
     stage.Reload()
     assert any(words in error for error in usd_errors(tmp_path / "head.usda"))
 
 
-def test_usdz_is_stored_aligned_and_repeatable(exported, tmp_path):
-    package, again = exported["head"] / "head.usdz", tmp_path / "again.usdz"
-    os.utime(exported["head"] / "envmap.exr", (1, 1_000_000_000))
-    write_usdz(again, exported["head"] / "head.usda")
-    assert package.read_bytes() == again.read_bytes()
+def test_usdz_is_stored_and_aligned(exported):
+    package = exported["head"] / "head.usdz"
     with zipfile.ZipFile(package) as archive:
         members = archive.infolist()
-        assert members[0].filename == "head.usda"
-        used = {f"maps/{name}.exr" for name in (*toy_maps(), "specular_ior")} - {"maps/confidence.exr"}
-        assert {member.filename for member in members[1:]} == used | {"envmap.exr"}
+        used = {"diffuse_albedo.png", "roughness.png", "normal.png", "specular_intensity.exr", "specular_ior.exr"}
+        assert members[0].filename == "head.usdc"
+        assert {member.filename for member in members[1:]} == {f"maps/{name}" for name in used} | {"envmap.exr"}
         for member in members:
             assert member.compress_type == zipfile.ZIP_STORED
             content = archive.read(member)
             assert package.read_bytes().index(content) % 64 == 0
-    stage = Usd.Stage.Open(str(package))
-    assert stage.GetDefaultPrim().GetPrimAtPath("geo/head").IsA(UsdGeom.Mesh)
+
+
+def test_usdz_holds_the_same_asset(exported):
+    """One layer with both variants, the same mesh, motion, camera and light; textures within 8-bit coding."""
+    whole, packed = (Usd.Stage.Open(str(exported["head"] / name)) for name in ("head.usda", "head.usdz"))
+    assert len(packed.GetLayerStack(includeSessionLayers=False)) == 1 and len(packed.GetUsedLayers()) <= 2
+    for name in ("geo/head", "capture/camera", "capture/light", "mtl/skin/openpbr_surface"):
+        first, second = (stage.GetDefaultPrim().GetPrimAtPath(name) for stage in (whole, packed))
+        assert first.GetTypeName() == second.GetTypeName() != ""
+        for attribute in first.GetAuthoredAttributes():
+            other = second.GetAttribute(attribute.GetName())
+            if attribute.GetTypeName() != Sdf.ValueTypeNames.Asset:
+                assert attribute.Get(float(FRAMES[2])) == other.Get(float(FRAMES[2])), attribute.GetPath()
+    assert packed.GetDefaultPrim().GetVariantSets().GetNames() == [VARIANT_SET]
+    assert shader(packed, "preview_diffuse_albedo").GetInput("sourceColorSpace").Get() == "sRGB"
+    with zipfile.ZipFile(exported["head"] / "head.usdz") as archive:
+        codes = cv2.imdecode(np.frombuffer(archive.read("maps/diffuse_albedo.png"), np.uint8), cv2.IMREAD_UNCHANGED)
+    coded = encode_srgb(toy_maps()["diffuse_albedo"])
+    np.testing.assert_allclose(codes[..., ::-1] / 255.0, coded, atol=0.5 / 255 + 1e-6)
+
+
+def test_package_rules_are_checked(exported, tmp_path):
+    assert package_errors(exported["head"] / "head.usdz") == []
+    write_usdz(tmp_path / "text.usdz", exported["head"] / "head.usda")
+    found = " ".join(package_errors(tmp_path / "text.usdz"))
+    assert "expected one .usdc" in found and "diffuse_albedo.exr is no PNG" in found
 
 
 def test_usdz_refuses_a_missing_texture(exported, tmp_path):
-    (tmp_path / "head.usda").write_bytes((exported["head"] / "head.usda").read_bytes())
+    (tmp_path / "head_mtl.usda").write_bytes((exported["head"] / "head_mtl.usda").read_bytes())
     with pytest.raises(LimnError, match="missing"):
-        write_usdz(tmp_path / "head.usdz", tmp_path / "head.usda")
+        write_usdz(tmp_path / "head.usdz", tmp_path / "head_mtl.usda")
 
 
 def test_maps_keep_values_and_say_what_they_are(exported):
@@ -305,7 +381,8 @@ def test_maps_keep_values_and_say_what_they_are(exported):
         assert channel.pixels.dtype == np.float16
         assert header["colorInteropID"] == ("lin_rec709_scene" if name == "diffuse_albedo" else "data")
         assert header["limn:stage"] == "export_usd" and header["limn:stage_version"] == export_usd.STAGE.version
-        assert header["limn:unit"]
+        assert header["limn:unit"] and header["limn:content"] == name and header["limn:source"] == "inverse_render"
+        assert ("chromaticities" in header) == (name == "diffuse_albedo")
     with OpenEXR.File(str(exported["head"] / "envmap.exr")) as file:
         assert file.header()["envmap"] == OpenEXR.ENVMAP_LATLONG
 
@@ -315,12 +392,69 @@ def test_half_floats_are_clamped_not_infinite(tmp_path):
     np.testing.assert_array_equal(read_exr(tmp_path / "sun.exr"), 65504.0)
 
 
+LEVELS = {"scanline": 1, "tiled": 1, "mipmap": 8}
+
+
+@pytest.mark.parametrize("layout", LEVELS)
+@pytest.mark.parametrize("half", [True, False])
+def test_layouts_hold_the_same_pixels(tmp_path, layout, half):
+    """Level 0 is exact, each further level the box mean of the one before; the bytes do not depend on the time."""
+    values = np.random.default_rng(8).uniform(0.0, 2.0, (128, 128, 3)).astype(np.float16 if half else np.float32)
+    options = {"colour_space": "lin_ap1_scene", "half": half, "layout": layout, "attributes": {"unit": "u"}}
+    for name in ("a.exr", "b.exr"):
+        write_exr(tmp_path / name, values, **options)
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+    np.testing.assert_array_equal(read_exr(tmp_path / "a.exr"), values.astype(np.float32))
+    with OpenEXR.File(str(tmp_path / "a.exr")) as file:
+        header = dict(file.header())
+    assert header["colorInteropID"] == "lin_ap1_scene" and header["limn:unit"] == "u"
+    np.testing.assert_allclose(header["chromaticities"][:2], (0.713, 0.293), atol=1e-6)
+    assert ("tiles" in header) == (layout != "scanline")
+    buffer, levels = OpenImageIO.ImageBuf(str(tmp_path / "a.exr")), []
+    assert buffer.nmiplevels == LEVELS[layout]
+    for level in range(buffer.nmiplevels):
+        levels.append(OpenImageIO.ImageBuf(str(tmp_path / "a.exr"), 0, level).get_pixels(OpenImageIO.FLOAT))
+    for fine, coarse in zip(levels, levels[1:], strict=False):
+        size = len(coarse)
+        np.testing.assert_allclose(coarse, fine.reshape(size, 2, size, 2, 3).mean((1, 3)), rtol=2e-3, atol=1e-3)
+
+
+@pytest.mark.skipif(shutil.which("exrheader") is None, reason="needs OpenEXR's own tools (Debian: openexr)")
+@pytest.mark.parametrize("layout", LEVELS)
+def test_openexrs_own_tools_read_the_files(tmp_path, layout):
+    path = tmp_path / "a.exr"
+    write_exr(path, np.full((64, 64), 0.5), colour_space="data", half=True, layout=layout, attributes={"unit": "share"})
+    told = subprocess.run(["exrheader", str(path)], capture_output=True, text=True, check=True).stdout
+    assert 'colorInteropID (type string): "data"' in told and 'limn:unit (type string): "share"' in told
+    assert ("mip-map" in told) == (layout == "mipmap")
+    subprocess.run(["exrmaketiled", str(path), str(tmp_path / "tiled.exr")], check=True)  # decodes every pixel
+    np.testing.assert_array_equal(read_exr(tmp_path / "tiled.exr"), 0.5)
+
+
+def test_unknown_layouts_are_refused(tmp_path):
+    with pytest.raises(LimnError, match="layout"):
+        write_exr(tmp_path / "a.exr", np.ones((4, 4)), colour_space="data", layout="ripmap")
+
+
+def test_udim_names(work, tmp_path):
+    """Maps are named as tile 1001, the materials read that tile, and the asset still validates."""
+    job = ToyJob(work["head"], tmp_path / "export", udim=True, map_layout="mipmap")
+    export_usd.run(job)
+    export_usd.check(job)
+    assert {path.name for path in (job.out / "maps").iterdir()} == {f"{name}.1001.exr" for name in MAPS}
+    stage = Usd.Stage.Open(str(job.out / "head.usda"))
+    for name in ("preview_diffuse_albedo", "openpbr_diffuse_albedo"):
+        assert shader(stage, name).GetInput("file").Get().path == "./maps/diffuse_albedo.1001.exr"
+    assert OpenImageIO.ImageBuf(str(job.out / "maps" / "normal.1001.exr")).nmiplevels == 5
+
+
 def test_choices_of_format(work, tmp_path):
-    options = {"map_format": "float", "acescg": True, "png_copies": "16", "usdz": False}
+    options = {"map_format": "float", "acescg": True, "png_copies": "16", "usdz": False, "glb": False, "plates": False}
     job = ToyJob(work["head"], tmp_path / "export", **options)
     export_usd.run(job)
     export_usd.check(job)
-    assert not (job.out / "head.usdz").exists()
+    assert not any((job.out / name).exists() for name in ("head.usdz", "head.glb", "plates"))
+    assert not Usd.Stage.Open(str(job.out / "head.usda")).GetDefaultPrim().GetPrimAtPath("capture/plate")
     albedo = toy_maps()["diffuse_albedo"]
     np.testing.assert_allclose(read_exr(job.out / "maps" / "diffuse_albedo.exr"), acescg_from_rec709(albedo), atol=1e-6)
     np.testing.assert_array_equal(read_exr(job.out / "maps" / "roughness.exr"), toy_maps()["roughness"])

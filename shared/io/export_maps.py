@@ -19,7 +19,11 @@ MAPS = {
     "roughness": ("data", "square root of GGX alpha"),
     "normal": ("data", "tangent space, n * 0.5 + 0.5"),
     "confidence": ("data", "0 to 1: how well the clip determines the texel"),
+    "specular_ior": ("data", "index of refraction that shows the specular intensity, for UsdPreviewSurface"),
 }
+SOLVED_MAPS = tuple(name for name in MAPS if name != "specular_ior")
+"""Those that inverse_render makes; specular_ior follows from specular_intensity."""
+UDIM_TILE = 1001
 WORKING_SPACE, ACESCG = "lin_rec709_scene", "lin_ap1_scene"
 
 
@@ -34,50 +38,70 @@ def acescg_from_rec709(rgb: np.ndarray) -> np.ndarray:
 
 
 class MapWriter:
-    """Writes linear Rec.709 and data arrays with one choice of precision and colour space.
+    """Writes linear Rec.709 and data arrays with one choice of precision, colour space, layout and names.
 
     half: 16-bit floats, values beyond +-65504 clamped. acescg: colours are converted. attributes go into each file.
+    layout: of the maps, one of images.LAYOUTS. udim: maps are named as tile 1001 of a set of tiles.
     """
 
-    def __init__(self, half: bool, acescg: bool, attributes: Mapping[str, str | int | float]):
+    def __init__(
+        self,
+        half: bool,
+        acescg: bool,
+        attributes: Mapping[str, str | int | float],
+        layout: str = "scanline",
+        udim: bool = False,
+    ):
         self.half, self.acescg, self.attributes = half, acescg, dict(attributes)
+        self.layout, self.udim = layout, udim
 
     @property
     def colour_space(self) -> str:
         """Colour space of what is written for colours."""
         return ACESCG if self.acescg else WORKING_SPACE
 
+    def file_name(self, name: str) -> str:
+        """The map's file."""
+        return f"{name}.{UDIM_TILE}.exr" if self.udim else f"{name}.exr"
+
     def write_colour(self, path: Path, rgb: np.ndarray, unit: str, *, latlong: bool = False) -> None:
         """[H, W, 3] scene-linear Rec.709 -> EXR in colour_space."""
         converted = acescg_from_rec709(rgb) if self.acescg else rgb
         extra = {"layout": "+y top row, +z centre, +x left of it"} if latlong else {}
-        self._write(path, converted, self.colour_space, {"unit": unit, **extra}, latlong)
+        self._write(path, converted, self.colour_space, {"unit": unit, **extra}, latlong=latlong)
 
-    def write_data(self, path: Path, values: np.ndarray, unit: str) -> None:
-        """[H, W] or [H, W, 3] numbers that are no colours -> EXR."""
-        self._write(path, values, "data", {"unit": unit}, False)
-
-    def _write(self, path, values, colour_space, attributes, latlong) -> None:
-        attributes = {**self.attributes, **attributes}
-        write_exr(path, values, colour_space=colour_space, half=self.half, attributes=attributes, latlong=latlong)
+    def write_map(self, folder: Path, name: str, values: np.ndarray) -> None:
+        """A map named as in MAPS into folder."""
+        kind, unit = MAPS[name]
+        is_colour = kind == "colour"
+        converted = acescg_from_rec709(values) if is_colour and self.acescg else values
+        space = self.colour_space if is_colour else "data"
+        content = {"unit": unit, "content": name}
+        self._write(folder / self.file_name(name), converted, space, content, layout=self.layout)
 
     def write_maps(self, folder: Path, maps: Mapping[str, np.ndarray]) -> None:
         """Each of maps, named as in MAPS, into folder."""
         folder.mkdir(parents=True, exist_ok=True)
         for name, values in maps.items():
-            kind, unit = MAPS[name]
-            write = self.write_colour if kind == "colour" else self.write_data
-            write(folder / f"{name}.exr", values, unit)
+            self.write_map(folder, name, values)
+
+    def _write(self, path, values, colour_space, attributes, latlong=False, layout="scanline") -> None:
+        attributes = {**self.attributes, **attributes}
+        write_exr(path, values, colour_space=colour_space, half=self.half, attributes=attributes, latlong=latlong,
+                  layout=layout)
+
+
+def integer_codes(name: str, values: np.ndarray, bits: int) -> np.ndarray:
+    """A map as 8- or 16-bit codes: colours sRGB-coded, data linear, both clipped to [0, 1]."""
+    coded = encode_srgb(values) if MAPS[name][0] == "colour" else np.clip(values, 0.0, 1.0)
+    return (coded * (2**bits - 1) + 0.5).astype(np.uint8 if bits == 8 else np.uint16)
 
 
 def write_png_copies(folder: Path, maps: Mapping[str, np.ndarray], bits: int) -> None:
-    """Integer copies, 8 or 16 bits: colours sRGB-coded, data linear, both clipped to [0, 1]."""
+    """Integer copies, as integer_codes says."""
     folder.mkdir(parents=True, exist_ok=True)
-    maximum = 2**bits - 1
     for name, values in maps.items():
-        coded = encode_srgb(values) if MAPS[name][0] == "colour" else np.clip(values, 0.0, 1.0)
-        codes = (coded * maximum + 0.5).astype(np.uint8 if bits == 8 else np.uint16)
-        write_png(folder / f"{name}.png", codes)
+        write_png(folder / f"{name}.png", integer_codes(name, values, bits))
 
 
 def paste_crop(crop: np.ndarray, placement: tuple[float, float, float], size: tuple[int, int]) -> np.ndarray:

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import OpenEXR
+import OpenImageIO
 
 from shared.errors import InputError, LimnError
 
@@ -19,6 +20,9 @@ _ACESCG = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
 _CHROMATICITIES = {"lin_rec709_scene": _REC709, "lin_ap1_scene": _ACESCG}
 COLOUR_SPACES = (*_CHROMATICITIES, "data")
 HALF_MAXIMUM = 65504.0
+LAYOUTS = ("scanline", "tiled", "mipmap")
+TILE = 64
+_NO_DATE = "1980:01:01 00:00:00"
 
 
 def write_exr(
@@ -29,12 +33,14 @@ def write_exr(
     half: bool = False,
     attributes: dict[str, str | int | float] | None = None,
     latlong: bool = False,
+    layout: str = "scanline",
 ) -> None:
-    """Writes [H, W] (channel Y) or [H, W, 3] (RGB) as a ZIP-compressed scan-line EXR.
+    """Writes [H, W] (channel Y) or [H, W, 3] (RGB) as a ZIP-compressed EXR.
 
     colour_space: one of COLOUR_SPACES ("data": no colour). half: 16-bit floats, clamped to +-65504. attributes are
-    stored as "limn:<name>". latlong marks an environment map. Errors: LimnError for a wrong shape, for values that
-    are not finite, or when the file does not read back as written.
+    stored as "limn:<name>". latlong marks an environment map. layout: one of LAYOUTS; mipmap halves the picture down
+    to one pixel by box filter, in tiles. Errors: LimnError for a wrong shape, for values that are not finite, or when
+    the file does not read back as written.
     """
     array = np.asarray(array)
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:
@@ -44,11 +50,50 @@ def write_exr(
     if half:
         array = np.clip(array, -HALF_MAXIMUM, HALF_MAXIMUM)
     pixels = np.ascontiguousarray(array, np.float16 if half else np.float32)
-    with OpenEXR.File(_header(colour_space, attributes or {}, latlong), {_channel(pixels): pixels}) as file:
-        file.write(str(path))
+    header = _header(colour_space, attributes or {}, latlong)
+    if layout not in LAYOUTS or (layout == "mipmap" and latlong):
+        raise LimnError(f"{path}: no layout {layout!r} for this picture; known: {', '.join(LAYOUTS)}")
+    if layout == "mipmap":
+        _write_mipmaps(path, pixels, header)
+    else:
+        if layout == "tiled":
+            header |= {"type": OpenEXR.tiledimage, "tiles": _one_level()}
+        with OpenEXR.File(header, {_channel(pixels): pixels}) as file:
+            file.write(str(path))
     with OpenEXR.File(str(path)) as file:
         if not np.array_equal(file.channels()[_channel(pixels)].pixels, pixels):
             raise LimnError(f"{path}: the file does not read back as written")
+
+
+def _one_level() -> OpenEXR.TileDescription:
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize = tiles.ySize = TILE
+    tiles.mode = OpenEXR.ONE_LEVEL
+    return tiles
+
+
+def _write_mipmaps(path: Path | str, pixels: np.ndarray, header: dict) -> None:
+    """Through OpenImageIO: the OpenEXR binding writes mip levels that nothing can read."""
+    planes = pixels if pixels.ndim == 3 else pixels[..., None]
+    height, width, channels = planes.shape
+    kind = "half" if pixels.dtype == np.float16 else "float"
+    spec = OpenImageIO.ImageSpec(width, height, channels, kind)
+    spec.channelnames = tuple(_channel(pixels))
+    for name, value in header.items():
+        if name == "chromaticities":
+            spec.attribute(name, OpenImageIO.TypeDesc("float[8]"), value)
+        elif isinstance(value, (str, int, float)):
+            spec.attribute(name, value)
+    spec.attribute("DateTime", _NO_DATE)  # else the time of writing, and no two files alike
+    source, target = OpenImageIO.ImageBuf(spec), OpenImageIO.ImageSpec()
+    source.set_pixels(OpenImageIO.ROI.All, np.ascontiguousarray(planes))
+    target.set_format(kind)
+    target.tile_width = target.tile_height = TILE
+    options = {"compression": "zip", "wrapmodes": "clamp,clamp", "maketx:filtername": "box", "maketx:hash": 0}
+    for name, value in options.items():
+        target.attribute(name, value)
+    if not OpenImageIO.ImageBufAlgo.make_texture(OpenImageIO.MakeTxTexture, source, str(path), target):
+        raise LimnError(f"{path}: {OpenImageIO.geterror()}")
 
 
 def _channel(pixels: np.ndarray) -> str:

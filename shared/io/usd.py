@@ -1,22 +1,26 @@
-"""The head as a USD asset: one layer that a studio can reference and that any viewer opens.
+"""The head as a USD asset: one folder that a studio can reference and that any viewer opens.
 
-    /<subject>        Xform, default prim, kind component, assetInfo
-      geo/head        Mesh in millimetres, faceVarying UVs and normals
-      mtl/skin        Material: UsdPreviewSurface and OpenPBR
-      capture         camera and dome light, in the variant "clip" of the variant set "capture"
+    head.usda           the interface: default prim, kind, assetInfo, extents, variants; loads in no time
+      payload           head_payload.usda, sublayers of head_geo.usdc and head_mtl.usda
+
+    /<subject>          Xform, default prim, kind component, assetInfo, inherits /__class__/<subject>
+      geo/head          Mesh in millimetres, faceVarying UVs and normals
+      mtl/skin          Material: UsdPreviewSurface and OpenPBR
+      capture           camera, dome light and the clip's card, in the variant "clip" of the variant set "capture"
 
 The variant "clip" (the default) replays the capture: the head's (or the camera's) motion as time samples, the
-light at rest. The variant "still" leaves the head alone at head space's origin, for use in another scene.
+light at rest, the clip on a card of purpose guide. The variant "still" leaves the head alone at head space's
+origin, for use in another scene.
 
 References: USD Working Group, Guidelines for structuring USD assets; UsdGeomMesh, UsdGeomCamera,
-UsdLuxDomeLight.
+UsdLuxDomeLight, UsdGeomModelAPI.
 """
 
 from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,29 +28,39 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from shared.errors import LimnError
-from shared.io.usd_capture import Capture, animate, define_camera, define_dome_light, world_from_head_rigid
-from shared.io.usd_material import define_material
-from shared.mesh import Mesh, vertex_normals
+from shared.io.usd_capture import (
+    Capture,
+    Plate,
+    animate,
+    define_camera,
+    define_dome_light,
+    define_plate,
+    world_from_head_rigid,
+)
+from shared.io.usd_geometry import define_mesh
+from shared.io.usd_material import Texture, define_material
+from shared.mesh import Mesh
 
 METERS_PER_UNIT = 0.001
 VARIANT_SET, VARIANT_CLIP, VARIANT_STILL = "capture", "clip", "still"
+INTERFACE, PAYLOAD, GEOMETRY, MATERIALS = "head.usda", "head_payload.usda", "head_geo.usdc", "head_mtl.usda"
 
 
 @dataclass(frozen=True)
 class HeadAsset:
     """Everything that goes into head.usda. Paths are relative to the layer.
 
-    maps: {name of usd_material.SHADER_INPUTS: path}; envmap: path; colour_space of the linear colour maps;
-    metadata: nested dictionaries of strings, numbers and lists for the root prim's customData["limn"].
+    maps: {name of usd_material.SHADER_INPUTS: texture}; envmap: the dome light's texture; plate: the clip's frames, or
+    None; metadata: nested dictionaries of strings, numbers and lists for the root prim's customData["limn"].
     """
 
     name: str
     mesh: Mesh
-    maps: Mapping[str, str]
-    envmap: str
+    maps: Mapping[str, Texture]
+    envmap: Texture
     capture: Capture
+    plate: Plate | None = None
     version: str = "1"
-    colour_space: str = "lin_rec709_scene"
     metadata: Mapping[str, object] = field(default_factory=dict)
 
 
@@ -64,27 +78,78 @@ def prim_name(name: str) -> str:
     return f"_{cleaned}" if cleaned[0].isdigit() else cleaned
 
 
-def write_head_usda(path: Path | str, asset: HeadAsset) -> None:
-    """Writes the layer; the same asset gives the same bytes. LimnError when USD cannot write it."""
-    path = Path(path)
-    stage = Usd.Stage.CreateInMemory(path.name)
-    _stage_metadata(stage, asset)
-    root = _define_root(stage, asset)
-    root_path = root.GetPath()
-    material_path = root_path.AppendPath("mtl/skin")
-    UsdGeom.Scope.Define(stage, root_path.AppendChild("geo"))
-    UsdGeom.Scope.Define(stage, root_path.AppendChild("mtl"))
-    mesh = define_mesh(stage, str(root_path.AppendPath("geo/head")), asset.mesh)
-    material = define_material(stage, str(material_path), asset.maps, asset.colour_space)
-    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
-    _define_capture(stage, root, mesh, asset)
-    if not stage.GetRootLayer().Export(str(path)):
+def write_head_usda(folder: Path | str, asset: HeadAsset) -> None:
+    """Writes the four layers into folder; the same asset gives the same bytes. LimnError when USD cannot write one."""
+    folder, root = Path(folder), Sdf.Path.absoluteRootPath.AppendChild(prim_name(asset.name))
+    layers = {GEOMETRY: _layer(_define_geometry, root, asset), MATERIALS: _layer(_define_materials, root, asset)}
+    # While the interface is authored the heavy layers lie below it, so that types resolve; then they become a payload.
+    layers[INTERFACE] = _layer(_define_interface, root, asset, [layers[MATERIALS], layers[GEOMETRY]])
+    layers[PAYLOAD] = _layer(_define_nothing, root, asset)
+    layers[PAYLOAD].subLayerPaths = [f"./{MATERIALS}", f"./{GEOMETRY}"]
+    prim = layers[INTERFACE].GetPrimAtPath(root)
+    prim.specifier, prim.typeName = Sdf.SpecifierDef, "Xform"
+    prim.payloadList.Prepend(Sdf.Payload(f"./{PAYLOAD}"))
+    prim.assetInfo["identifier"] = Sdf.AssetPath(f"./{INTERFACE}")
+    prim.assetInfo["payloadAssetDependencies"] = Sdf.AssetPathArray([Sdf.AssetPath(f"./{PAYLOAD}")])
+    kind = Sdf.CreatePrimInLayer(layers[INTERFACE], f"/__class__/{root.name}")
+    for spec in (kind, kind.nameParent):
+        spec.specifier = Sdf.SpecifierClass
+    prim.inheritPathList.Prepend(kind.path)
+    for name, layer in layers.items():
+        if not layer.Export(str(folder / name)):
+            raise LimnError(f"{folder / name}: USD could not write the layer")
+
+
+def _layer(define: Callable, root: Sdf.Path, asset: HeadAsset, below: Sequence[Sdf.Layer] = ()) -> Sdf.Layer:
+    """What define writes about the asset over the layers below, as a layer of its own."""
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.subLayerPaths = [other.identifier for other in below]
+    stage = Usd.Stage.Open(layer)
+    _layer_metadata(stage)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, root).GetPrim())
+    define(stage, root, asset)
+    del stage
+    layer.subLayerPaths.clear()
+    return layer
+
+
+def _define_nothing(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None:
+    """The payload's own opinions: none."""
+
+
+def write_single_layer(path: Path | str, asset: HeadAsset) -> None:
+    """The same prims in one layer without composition arcs but for the variants, as packages want it."""
+    def define(*arguments) -> None:
+        for part in (_define_geometry, _define_materials, _define_interface):
+            part(*arguments)
+
+    root = Sdf.Path.absoluteRootPath.AppendChild(prim_name(asset.name))
+    layer = _layer(define, root, asset)
+    layer.GetPrimAtPath(root).assetInfo["identifier"] = Sdf.AssetPath(f"./{Path(path).name}")
+    if not layer.Export(str(path)):
         raise LimnError(f"{path}: USD could not write the layer")
 
 
-def _stage_metadata(stage: Usd.Stage, asset: HeadAsset) -> None:
+def _layer_metadata(stage: Usd.Stage) -> None:
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, METERS_PER_UNIT)
+
+
+def _define_geometry(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None:
+    UsdGeom.Scope.Define(stage, root.AppendChild("geo"))
+    define_mesh(stage, str(root.AppendPath("geo/head")), asset.mesh)
+
+
+def _define_materials(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None:
+    """The material and its binding: a layer that can be muted or replaced without the geometry."""
+    UsdGeom.Scope.Define(stage, root.AppendChild("mtl"))
+    material = define_material(stage, str(root.AppendPath("mtl/skin")), asset.maps)
+    mesh = stage.OverridePrim(root.AppendPath("geo/head"))
+    UsdShade.MaterialBindingAPI.Apply(mesh).Bind(material)
+
+
+def _define_interface(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None:
+    """What a scene sees of the asset before it loads the payload."""
     frames = asset.capture.frame_index
     stage.SetStartTimeCode(float(frames.min()))
     stage.SetEndTimeCode(float(frames.max()))
@@ -94,60 +159,51 @@ def _stage_metadata(stage: Usd.Stage, asset: HeadAsset) -> None:
         "A head recovered from a clip by Limn. Lengths in millimetres; time codes are frames of the clip. "
         "Variant set 'capture': 'clip' replays the clip with its camera and light, 'still' is the head alone."
     )
-
-
-def _define_root(stage: Usd.Stage, asset: HeadAsset) -> Usd.Prim:
-    name = prim_name(asset.name)
-    prim = UsdGeom.Xform.Define(stage, f"/{name}").GetPrim()
-    stage.SetDefaultPrim(prim)
+    prim = stage.GetPrimAtPath(root)
     model = Usd.ModelAPI(prim)
     model.SetKind(Kind.Tokens.component)
-    model.SetAssetName(name)
-    model.SetAssetIdentifier(Sdf.AssetPath("./head.usda"))
+    model.SetAssetName(root.name)
     model.SetAssetVersion(asset.version)
     prim.SetDisplayName(asset.name)
     prim.SetCustomDataByKey("limn", {"subject": asset.name, **asset.metadata})
-    return prim
+    _define_variants(stage, prim, asset)
 
 
-def define_mesh(stage: Usd.Stage, path: str, mesh: Mesh) -> UsdGeom.Mesh:
-    """A polygon mesh (subdivisionScheme none) with indexed faceVarying UVs and normals, and its extent."""
-    prim = UsdGeom.Mesh.Define(stage, path)
-    points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.vertices, np.float32))
-    faces = Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.faces.ravel(), np.int32))
-    prim.CreatePointsAttr(points)
-    prim.CreateFaceVertexIndicesAttr(faces)
-    prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
-    prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    prim.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
-    prim.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
-    primvars = UsdGeom.PrimvarsAPI(prim)
-    types, varying = Sdf.ValueTypeNames, UsdGeom.Tokens.faceVarying
-    coordinates = primvars.CreatePrimvar("st", types.TexCoord2fArray, varying)
-    coordinates.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(mesh.uvs, np.float32)))
-    coordinates.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.face_uvs.ravel(), np.int32)))
-    normals = primvars.CreatePrimvar("normals", types.Normal3fArray, varying)
-    smooth = vertex_normals(mesh.vertices, mesh.faces)
-    smooth[np.linalg.norm(smooth, axis=1) < 0.5] = (0.0, 0.0, 1.0)  # only faces without area around it: any unit vector
-    normals.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(smooth, np.float32)))
-    normals.SetIndices(faces)
-    return prim
-
-
-def _define_capture(stage: Usd.Stage, root: Usd.Prim, mesh: UsdGeom.Mesh, asset: HeadAsset) -> None:
+def _define_variants(stage: Usd.Stage, root: Usd.Prim, asset: HeadAsset) -> None:
     variants = root.GetVariantSets().AddVariantSet(VARIANT_SET)
     for name in (VARIANT_CLIP, VARIANT_STILL):
         variants.AddVariant(name)
-    variants.SetVariantSelection(VARIANT_CLIP)
-    scope = root.GetPath().AppendChild("capture")
-    capture = asset.capture
+    vertices = asset.mesh.vertices
+    UsdGeom.ModelAPI.Apply(root)
+    variants.SetVariantSelection(VARIANT_STILL)
     with variants.GetVariantEditContext():
-        UsdGeom.Scope.Define(stage, scope)
-        camera = define_camera(stage, str(scope.AppendChild("camera")), capture)
-        camera.GetPrim().SetCustomDataByKey("limn", _camera_metadata(capture))
-        define_dome_light(stage, str(scope.AppendChild("light")), asset.envmap, asset.colour_space)
-        if capture.moves == "head":
-            animate(mesh, world_from_head_rigid(capture), capture.frame_index)
+        _set_extents(root, vertices[None])
+    variants.SetVariantSelection(VARIANT_CLIP)
+    with variants.GetVariantEditContext():
+        moved = world_from_head_rigid(asset.capture)
+        box = np.array(np.meshgrid(*np.stack([vertices.min(0), vertices.max(0)]).T)).reshape(3, -1).T
+        _set_extents(root, np.einsum("fij,nj->fni", moved[:, :3, :3], box) + moved[:, None, :3, 3])
+        _define_capture(stage, root, asset)
+
+
+def _set_extents(root: Usd.Prim, points: np.ndarray) -> None:
+    """extentsHint around points [..., 3]: what is drawn for the asset while its payload is not loaded."""
+    corners = points.reshape(-1, 3)
+    bounds = np.stack([corners.min(0), corners.max(0)]).astype(np.float32)
+    UsdGeom.ModelAPI(root).SetExtentsHint(Vt.Vec3fArray.FromNumpy(bounds))
+
+
+def _define_capture(stage: Usd.Stage, root: Usd.Prim, asset: HeadAsset) -> None:
+    scope, capture = root.GetPath().AppendChild("capture"), asset.capture
+    UsdGeom.Scope.Define(stage, scope)
+    camera = define_camera(stage, str(scope.AppendChild("camera")), capture)
+    camera.GetPrim().SetCustomDataByKey("limn", _camera_metadata(capture))
+    define_dome_light(stage, str(scope.AppendChild("light")), asset.envmap)
+    if asset.plate is not None:
+        define_plate(stage, str(scope.AppendChild("plate")), capture, asset.plate)
+    if capture.moves == "head":
+        head = UsdGeom.Mesh(stage.GetPrimAtPath(root.GetPath().AppendPath("geo/head")))
+        animate(head, world_from_head_rigid(capture), capture.frame_index)
 
 
 def _camera_metadata(capture: Capture) -> dict:

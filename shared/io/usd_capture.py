@@ -1,4 +1,4 @@
-"""Camera, light and motion of a clip in USD.
+"""Camera, light, motion and pictures of a clip in USD.
 
 The camera sits in the asset as filmed: lens and film back from the intrinsics, a shifted principal point as
 aperture offsets. UsdGeomCamera counts focal length and apertures in tenths of a scene unit, here tenths of a
@@ -9,12 +9,15 @@ towards +z, pi/2 towards +x) is the layout of Limn's environment maps.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from shared.geometry import WORLD_FROM_CAMERA, invert_rigid
+from shared.io.usd_geometry import define_card
+from shared.io.usd_material import Texture, define_plate_material
 
 DEFAULT_FILM_WIDTH_MM = 36.0
 """Film back assumed where only the focal length in pixels is known; the picture is the same for any."""
@@ -38,6 +41,15 @@ class Capture:
     height: int
     moves: str
     film_width_mm: float = DEFAULT_FILM_WIDTH_MM
+
+
+@dataclass(frozen=True)
+class Plate:
+    """The clip's pictures: files {frame: sRGB picture, path relative to the layer}, all showing one rectangle of the
+    frame: (left, top, right, bottom) in px, 0 at the frame's own edge."""
+
+    files: Mapping[int, str]
+    rectangle: tuple[float, float, float, float]
 
 
 def define_camera(stage: Usd.Stage, path: str, capture: Capture) -> UsdGeom.Camera:
@@ -106,12 +118,29 @@ def animate(prim: UsdGeom.Xformable, world_from_local: np.ndarray, time_codes: n
         last = rotation
 
 
-def define_dome_light(stage: Usd.Stage, path: str, envmap: str, colour_space: str) -> UsdLux.DomeLight:
-    """The recovered light: a dome with the lat-long map (path relative to the layer), intensity 1, at
-    rest."""
+def define_dome_light(stage: Usd.Stage, path: str, envmap: Texture) -> UsdLux.DomeLight:
+    """The recovered light: a dome with the lat-long map, intensity 1, at rest."""
     light = UsdLux.DomeLight.Define(stage, path)
     light.CreateIntensityAttr(1.0)
     light.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
-    texture = light.CreateTextureFileAttr(Sdf.AssetPath(envmap))
-    texture.SetColorSpace(colour_space)
+    texture = light.CreateTextureFileAttr(Sdf.AssetPath(envmap.path))
+    texture.SetColorSpace(envmap.colour_space)
     return light
+
+
+def define_plate(stage: Usd.Stage, path: str, capture: Capture, plate: Plate) -> UsdGeom.Xform:
+    """The clip on a card behind the head, as far away as twice the head, filling the camera's view of its rectangle.
+
+    Purpose guide: a viewer shows it when asked to display guides; renders, bounds and lighting leave it out.
+    """
+    holder = UsdGeom.Xform.Define(stage, path)
+    distance = 2.0 * float(np.linalg.norm(capture.camera_from_head[:, :3, 3], axis=1).mean())
+    left, top, right, bottom = plate.rectangle
+    pixels = np.array([[left, bottom, 1.0], [right, bottom, 1.0], [right, top, 1.0], [left, top, 1.0]])
+    rays = pixels @ np.linalg.inv(capture.intrinsics).T
+    card = define_card(stage, f"{path}/card", distance * rays @ WORLD_FROM_CAMERA)
+    material = define_plate_material(stage, f"{path}/material", plate.files)
+    UsdShade.MaterialBindingAPI.Apply(card.GetPrim()).Bind(material)
+    if capture.moves == "camera":
+        animate(holder, world_from_usd_camera(capture), capture.frame_index)
+    return holder

@@ -18,6 +18,7 @@ References: UsdPreviewSurface specification 2.6; OpenPBR surface 1.1, section 3.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdShade
@@ -33,7 +34,7 @@ SHADER_INPUTS = {
     "roughness": ("roughness", "specular_roughness"),
     "normal": ("normal", "geometry_normal"),
 }
-COLOUR_MAPS = ("diffuse_albedo",)
+SRGB = "srgb_rec709_scene"
 _PREVIEW_TYPES = {
     "diffuseColor": (Sdf.ValueTypeNames.Color3f, "rgb"),
     "ior": (Sdf.ValueTypeNames.Float, "r"),
@@ -50,6 +51,19 @@ NORMAL_SCALE, NORMAL_BIAS = Gf.Vec4f(2.0, 2.0, 2.0, 1.0), Gf.Vec4f(-1.0, -1.0, -
 """UsdUVTexture has to undo n * 0.5 + 0.5 by itself; the MaterialX normalmap node does it inside."""
 
 
+@dataclass(frozen=True)
+class Texture:
+    """A map's file (its path relative to the layer) and colour space: "data" or a name such as lin_rec709_scene."""
+
+    path: str
+    colour_space: str = "data"
+
+    @property
+    def preview_colour_space(self) -> str:
+        """What UsdUVTexture can say of it: sRGB or raw."""
+        return "sRGB" if self.colour_space == SRGB else "raw"
+
+
 def modulated_ior(specular_intensity: np.ndarray) -> np.ndarray:
     """[...] specular intensity -> [...] index of refraction whose F0 is 0.04 times the intensity.
 
@@ -61,21 +75,38 @@ def modulated_ior(specular_intensity: np.ndarray) -> np.ndarray:
     return ((1.0 + root) / (1.0 - root)).astype(np.float32)
 
 
-def define_material(
-    stage: Usd.Stage, path: str, maps: Mapping[str, str], colour_space: str
-) -> UsdShade.Material:
-    """Defines the material at path from maps {name of SHADER_INPUTS: file path relative to the layer}.
-
-    colour_space: of the linear colour maps, such as lin_rec709_scene. Maps that are absent leave the input's
-    default.
-    """
+def define_material(stage: Usd.Stage, path: str, maps: Mapping[str, Texture]) -> UsdShade.Material:
+    """Defines the material from maps {name of SHADER_INPUTS: texture}; absent ones leave the input's default."""
     material = UsdShade.Material.Define(stage, path)
-    _preview_surface(stage, material, maps, colour_space)
-    _open_pbr(stage, material, maps, colour_space)
+    _preview_surface(stage, material, maps)
+    _open_pbr(stage, material, maps)
     return material
 
 
-def _preview_surface(stage, material, maps, colour_space) -> None:
+def define_plate_material(stage: Usd.Stage, path: str, files: Mapping[int, str]) -> UsdShade.Material:
+    """Shows files {time code: path relative to the layer}, sRGB pictures, as they are whatever the light."""
+    material = UsdShade.Material.Define(stage, path)
+    surface = _shader(stage, material, "surface", "UsdPreviewSurface")
+    for name, value in (("roughness", 1.0), ("ior", 1.0)):  # an index of 1 reflects nothing
+        surface.CreateInput(name, Sdf.ValueTypeNames.Float).Set(value)
+    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(0.0))
+    reader = _shader(stage, material, "st", "UsdPrimvarReader_float2")
+    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+    coordinates = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+    texture = _shader(stage, material, "picture", "UsdUVTexture")
+    texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
+    file = texture.CreateInput("file", Sdf.ValueTypeNames.Asset)
+    file.GetAttr().SetColorSpace(SRGB)
+    for time, picture in files.items():
+        file.Set(Sdf.AssetPath(picture), float(time))
+    texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
+    output = texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+    surface.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(output)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+    return material
+
+
+def _preview_surface(stage: Usd.Stage, material: UsdShade.Material, maps: Mapping[str, Texture]) -> None:
     surface = _shader(stage, material, "preview_surface", "UsdPreviewSurface")
     surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
     surface.CreateInput("useSpecularWorkflow", Sdf.ValueTypeNames.Int).Set(0)
@@ -88,8 +119,9 @@ def _preview_surface(stage, material, maps, colour_space) -> None:
             continue
         texture = _shader(stage, material, f"preview_{name}", "UsdUVTexture")
         texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
-        _file_input(texture, maps[name], colour_space if name in COLOUR_MAPS else "data")
-        texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("raw")
+        _file_input(texture, maps[name])
+        source = texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token)
+        source.Set(maps[name].preview_colour_space)
         for axis in ("wrapS", "wrapT"):
             texture.CreateInput(axis, Sdf.ValueTypeNames.Token).Set("clamp")
         if name == "normal":
@@ -102,7 +134,7 @@ def _preview_surface(stage, material, maps, colour_space) -> None:
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
 
 
-def _open_pbr(stage, material, maps, colour_space) -> None:
+def _open_pbr(stage: Usd.Stage, material: UsdShade.Material, maps: Mapping[str, Texture]) -> None:
     surface = _shader(stage, material, "openpbr_surface", "ND_open_pbr_surface_surfaceshader")
     surface.CreateInput("specular_ior", Sdf.ValueTypeNames.Float).Set(IOR)
     surface.CreateInput("base_diffuse_roughness", Sdf.ValueTypeNames.Float).Set(0.0)
@@ -115,7 +147,7 @@ def _open_pbr(stage, material, maps, colour_space) -> None:
         node, value_type, default = _IMAGE_NODES[open_pbr_input]
         image = _shader(stage, material, f"openpbr_{name}", node)
         image.CreateInput("texcoord", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
-        _file_input(image, maps[name], colour_space if name in COLOUR_MAPS else "data")
+        _file_input(image, maps[name])
         image.CreateInput("default", value_type).Set(default)
         for axis in ("uaddressmode", "vaddressmode"):
             image.CreateInput(axis, Sdf.ValueTypeNames.String).Set("clamp")
@@ -135,7 +167,7 @@ def _shader(stage: Usd.Stage, material: UsdShade.Material, name: str, shader_id:
     return shader
 
 
-def _file_input(shader: UsdShade.Shader, file: str, colour_space: str) -> None:
+def _file_input(shader: UsdShade.Shader, texture: Texture) -> None:
     attribute = shader.CreateInput("file", Sdf.ValueTypeNames.Asset)
-    attribute.Set(Sdf.AssetPath(file))
-    attribute.GetAttr().SetColorSpace(colour_space)
+    attribute.Set(Sdf.AssetPath(texture.path))
+    attribute.GetAttr().SetColorSpace(texture.colour_space)

@@ -8,6 +8,7 @@ normal map.
 
 from __future__ import annotations
 
+import zipfile
 from functools import lru_cache
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from shared.mesh_checks import mesh_errors
 
 MATERIALX_PREFIX = "ND_"
 _FALSE_ALARM = "MissingShaderIdInRegistry"
+_LAYERS, _PICTURES = (".usd", ".usda", ".usdc"), (".png", ".jpg", ".jpeg", ".exr")
 # MaterialX type -> how it is spelled in USD, after usdMtlx's own table.
 _USD_TYPES = {
     "float": ("float",),
@@ -41,12 +43,40 @@ def usd_errors(path: Path | str) -> list[str]:
         return [f"{Path(path).name}: not a USD stage with a default prim"]
     errors = _validator_errors(stage)
     for prim in stage.Traverse():
-        if prim.IsA(UsdGeom.Mesh):
+        if prim.IsA(UsdGeom.Mesh) and UsdGeom.Imageable(prim).ComputePurpose() != UsdGeom.Tokens.guide:
             errors += _mesh_errors(UsdGeom.Mesh(prim))
         elif prim.IsA(UsdShade.Shader):
             errors += _shader_errors(UsdShade.Shader(prim))
         errors += _path_errors(prim)
     return [f"{Path(path).name}: {error}" for error in errors]
+
+
+def package_errors(path: Path | str) -> list[str]:
+    """What viewers for consumers ask of a .usdz beyond the validators: one binary layer, first, and plain pictures."""
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+    errors = []
+    layers = [name for name in names if Path(name).suffix in _LAYERS]
+    if layers != names[:1] or not names[0].endswith(".usdc"):
+        errors.append(f"expected one .usdc as the first member and no other layer, got {', '.join(layers) or 'none'}")
+    strange = [name for name in names if Path(name).suffix not in (*_LAYERS, *_PICTURES)]
+    if strange:
+        errors.append(f"neither layers nor pictures: {', '.join(strange)}")
+    stage = Usd.Stage.Open(str(path))
+    if UsdGeom.GetStageUpAxis(stage) != UsdGeom.Tokens.y:
+        errors.append("y is not up")
+    for prim in stage.Traverse():
+        if prim.IsA(UsdShade.Shader) and UsdShade.Shader(prim).GetShaderId() == "UsdPreviewSurface":
+            errors += [f"{file} is no PNG or JPEG" for file in _shown_files(UsdShade.Shader(prim))
+                       if Path(file).suffix not in (".png", ".jpg", ".jpeg")]
+    return [f"{Path(path).name}: {error}" for error in errors]
+
+
+def _shown_files(surface: UsdShade.Shader) -> list[str]:
+    """The textures of what every viewer shows: colour, roughness and normal. (Many ignore the index of refraction.)"""
+    inputs = [surface.GetInput(name) for name in ("diffuseColor", "roughness", "normal")]
+    sources = [port.GetConnectedSources()[0] for port in inputs if port and port.HasConnectedSource()]
+    return [UsdShade.Shader(found[0].source.GetPrim()).GetInput("file").Get().path for found in sources]
 
 
 def _validator_errors(stage: Usd.Stage) -> list[str]:
@@ -103,9 +133,10 @@ def _shader_errors(shader: UsdShade.Shader) -> list[str]:
     shader_id = shader.GetShaderId()
     if shader_id.startswith(MATERIALX_PREFIX):
         return _materialx_errors(shader, shader_id)
-    if shader_id != "UsdPreviewSurface" or not shader.GetInput("normal").HasConnectedSource():
+    normal = shader.GetInput("normal")
+    if shader_id != "UsdPreviewSurface" or not normal or not normal.HasConnectedSource():
         return []
-    texture = UsdShade.Shader(shader.GetInput("normal").GetConnectedSources()[0][0].source.GetPrim())
+    texture = UsdShade.Shader(normal.GetConnectedSources()[0][0].source.GetPrim())
     scale, bias = texture.GetInput("scale").Get(), texture.GetInput("bias").Get()
     if scale != NORMAL_SCALE or bias != NORMAL_BIAS:
         return [f"{texture.GetPath()}: scale {scale} and bias {bias} do not decode a normal map"]

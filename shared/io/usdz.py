@@ -1,24 +1,62 @@
-"""Packages a USD layer and its textures as .usdz, the same bytes for the same content.
+"""Packages a head as .usdz, the same bytes for the same content.
 
-A .usdz is a zip whose members are stored uncompressed with their data aligned to 64 bytes, the root layer
-first. USD's own packager stamps the files' modification times into it; this one stamps a constant.
+A .usdz is a zip whose members are stored uncompressed with their data aligned to 64 bytes, the root layer first.
+USD's own packager stamps the files' modification times into it; this one stamps a constant. What viewers for
+consumers ask beyond the format is kept too: one binary root layer that composes nothing from outside, y up, and
+8-bit PNG textures for what UsdPreviewSurface reads; only what PNG cannot hold (indices of refraction, specular
+weights beyond 1, the light) stays EXR, and a viewer that cannot read it falls back to skin's usual gloss.
 
 Reference: Usdz file format specification 1.3.
 """
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 import zipfile
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from pxr import UsdUtils
 
 from shared.errors import LimnError
+from shared.io.export_maps import MAPS, WORKING_SPACE, integer_codes
+from shared.io.images import write_exr, write_png
+from shared.io.usd import HeadAsset, write_single_layer
+from shared.io.usd_material import SHADER_INPUTS, SRGB, Texture
 
+PNG_MAPS = ("diffuse_albedo", "roughness", "normal")
 _ALIGNMENT = 64
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _LOCAL_HEADER = 30
 _PADDING_ID = 0x1986
+
+
+def write_head_usdz(path: Path | str, asset: HeadAsset, maps: Mapping[str, np.ndarray], envmap: np.ndarray) -> None:
+    """Packs the asset, its maps {name of export_maps.MAPS: [S, S] or [S, S, 3]} and envmap [H, W, 3], linear Rec.709.
+
+    The asset's own file names and the clip's pictures are left aside.
+    """
+    with tempfile.TemporaryDirectory() as scratch:
+        folder, textures = Path(scratch), {}
+        (folder / "maps").mkdir()
+        for name in SHADER_INPUTS:
+            is_colour = MAPS[name][0] == "colour"
+            if name in PNG_MAPS:
+                textures[name] = Texture(f"./maps/{name}.png", SRGB if is_colour else "data")
+                write_png(folder / textures[name].path, integer_codes(name, maps[name], 8))
+            else:
+                textures[name] = Texture(f"./maps/{name}.exr")
+                write_exr(folder / textures[name].path, maps[name], colour_space="data", half=True)
+        light = Texture("./envmap.exr", WORKING_SPACE)
+        write_exr(folder / light.path, envmap, colour_space=WORKING_SPACE, half=True, latlong=True)
+        layer = folder / "head.usdc"
+        write_single_layer(layer, replace(asset, maps=textures, envmap=light, plate=None))
+        package = folder / "head.usdz"
+        write_usdz(package, layer)
+        shutil.move(package, path)
 
 
 def write_usdz(path: Path | str, layer: Path | str) -> None:

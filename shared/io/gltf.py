@@ -1,0 +1,178 @@
+"""The head as binary glTF: mesh, textures, lens and motion for web viewers and game engines.
+
+glTF counts metres and seconds, its cameras look along -z with y up as USD's do, its v runs downwards. Roughness is
+the same (alpha = roughness^2), F0 is 0.04 without an index of refraction, and KHR_materials_specular scales it. What
+the format cannot say: a shifted principal point and an environment light; both are in head.usda.
+
+References: glTF 2.0 specification (GLB container, accessors, animations); KHR_materials_specular (F0 = min(0.04 *
+specularColor, 1) * specular).
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from shared.errors import LimnError
+from shared.io.export_maps import integer_codes
+from shared.io.usd_capture import Capture, world_from_head_rigid, world_from_usd_camera
+from shared.io.usd_geometry import shading_normals
+from shared.mesh import Mesh
+
+METRES_PER_MM = 0.001
+_FLOAT, _UINT = 5126, 5125
+_ARRAY, _INDEX = 34962, 34963
+_LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
+_KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+
+
+class _Buffer:
+    """The binary chunk as it grows, with the views and accessors into it."""
+
+    def __init__(self):
+        self.data, self.views, self.accessors = bytearray(), [], []
+
+    def add(self, content: bytes, target: int | None = None) -> int:
+        """-> index of the view."""
+        self.data += bytes(-len(self.data) % 4)
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content)}
+        self.views.append(view if target is None else view | {"target": target})
+        self.data += content
+        return len(self.views) - 1
+
+    def array(self, values: np.ndarray, target: int | None = None, bounds: bool = False) -> int:
+        """[N] or [N, C] floats or unsigned integers -> index of the accessor."""
+        is_index = values.dtype.kind == "u"
+        values = np.ascontiguousarray(values, "<u4" if is_index else "<f4")
+        columns = values.reshape(len(values), -1)
+        accessor = {
+            "bufferView": self.add(values.tobytes(), target),
+            "componentType": _UINT if is_index else _FLOAT,
+            "count": len(values),
+            "type": _KINDS[columns.shape[1]],
+        }
+        if bounds:
+            accessor |= {"min": columns.min(0).tolist(), "max": columns.max(0).tolist()}
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+
+def write_glb(path: Path | str, name: str, mesh: Mesh, maps: Mapping[str, np.ndarray], capture: Capture) -> None:
+    """One file with all inside. maps: diffuse_albedo, specular_intensity, roughness and normal, as exported."""
+    buffer = _Buffer()
+    textures, material = _material(buffer, maps)
+    width, height = capture.width, capture.height
+    content = {
+        "asset": {"version": "2.0", "generator": "Limn"},
+        "scene": 0,
+        "scenes": [{"name": name, "nodes": [0, 1]}],
+        "nodes": [{"name": "head", "mesh": 0}, {"name": "camera", "camera": 0}],
+        "meshes": [{"name": "head", "primitives": [_primitive(buffer, mesh)]}],
+        "materials": [material],
+        "extensionsUsed": ["KHR_materials_specular"],
+        "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
+        "images": [{"bufferView": view, "mimeType": "image/png"} for view in textures],
+        "textures": [{"sampler": 0, "source": k} for k in range(len(textures))],
+        "cameras": [{
+            "name": "camera",
+            "type": "perspective",
+            "perspective": {
+                "yfov": float(2.0 * np.arctan(0.5 * height / capture.intrinsics[1, 1])),
+                "aspectRatio": float(width * capture.intrinsics[1, 1] / (height * capture.intrinsics[0, 0])),
+                "znear": 0.01,
+            },
+        }],
+        "animations": [_animation(buffer, capture)],
+    }
+    content |= {
+        "accessors": buffer.accessors,
+        "bufferViews": buffer.views,
+        "buffers": [{"byteLength": len(buffer.data)}],
+    }
+    _write_container(Path(path), content, bytes(buffer.data))
+
+
+def _primitive(buffer: _Buffer, mesh: Mesh) -> dict:
+    """glTF knows one index per corner: vertices are doubled along texture seams."""
+    pairs = np.column_stack([mesh.faces.ravel(), mesh.face_uvs.ravel()])
+    corners, index = np.unique(pairs, axis=0, return_inverse=True)
+    vertex, coordinate = corners.T
+    attributes = {
+        "POSITION": buffer.array(mesh.vertices[vertex] * METRES_PER_MM, _ARRAY, bounds=True),
+        "NORMAL": buffer.array(shading_normals(mesh)[vertex], _ARRAY),
+        "TEXCOORD_0": buffer.array(mesh.uvs[coordinate] * [1.0, -1.0] + [0.0, 1.0], _ARRAY),
+    }
+    return {"attributes": attributes, "indices": buffer.array(index.ravel().astype(np.uint32), _INDEX), "material": 0}
+
+
+def _material(buffer: _Buffer, maps: Mapping[str, np.ndarray]) -> tuple[list[int], dict]:
+    """Views of the four pictures, and the material that reads them."""
+    roughness = integer_codes("roughness", maps["roughness"], 8)
+    nothing = np.zeros_like(roughness)
+    strongest = max(1.0, float(maps["specular_intensity"].max()))
+    share = np.clip(maps["specular_intensity"] / strongest, 0.0, 1.0)
+    weight = (share * 255.0 + 0.5).astype(np.uint8)
+    white = np.full_like(weight, 255)
+    pictures = (
+        integer_codes("diffuse_albedo", maps["diffuse_albedo"], 8),
+        np.stack([nothing, roughness, nothing], axis=-1),
+        integer_codes("normal", maps["normal"], 8),
+        np.stack([white, white, white, weight], axis=-1),
+    )
+    specular = {"specularTexture": {"index": 3}, "specularColorFactor": [strongest] * 3}
+    material = {
+        "name": "skin",
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": 0},
+            "metallicRoughnessTexture": {"index": 1},
+            "metallicFactor": 0.0,
+            "roughnessFactor": 1.0,
+        },
+        "normalTexture": {"index": 2},
+        "extensions": {"KHR_materials_specular": specular},
+    }
+    return [buffer.add(_png(picture)) for picture in pictures], material
+
+
+def _png(picture: np.ndarray) -> bytes:
+    """uint8 [H, W, 3] RGB or [H, W, 4] RGBA."""
+    order = [2, 1, 0, 3][: picture.shape[2]]
+    done, encoded = cv2.imencode(".png", np.ascontiguousarray(picture[..., order]), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not done:
+        raise LimnError("a texture could not be encoded")
+    return encoded.tobytes()
+
+
+def _animation(buffer: _Buffer, capture: Capture) -> dict:
+    """The motion of what moved, head (node 0) or camera (node 1), from 0 s at the first frame."""
+    node = 1 if capture.moves == "camera" else 0
+    world_from_local = world_from_usd_camera(capture) if node else world_from_head_rigid(capture)
+    seconds = (capture.frame_index - capture.frame_index[0]) / capture.fps
+    quaternions = Rotation.from_matrix(world_from_local[:, :3, :3]).as_quat()
+    flips = np.cumprod(np.where((quaternions[1:] * quaternions[:-1]).sum(1) < 0.0, -1.0, 1.0))
+    quaternions[1:] *= flips[:, None]
+    time = buffer.array(seconds, bounds=True)
+    outputs = {
+        "translation": buffer.array(world_from_local[:, :3, 3] * METRES_PER_MM),
+        "rotation": buffer.array(quaternions),
+    }
+    return {
+        "name": "clip",
+        "samplers": [{"input": time, "output": output, "interpolation": "LINEAR"} for output in outputs.values()],
+        "channels": [{"sampler": k, "target": {"node": node, "path": kind}} for k, kind in enumerate(outputs)],
+    }
+
+
+def _write_container(path: Path, content: dict, binary: bytes) -> None:
+    text = json.dumps(content, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    binary += bytes(-len(binary) % 4)
+    header = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    path.write_bytes(header + chunks)
