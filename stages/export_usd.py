@@ -4,7 +4,7 @@ Reads    sample_frames: frames.json and the frames (for the plates and the repor
          and overlay.png. init_albedo: its record. inverse_render: maps, envmap.exr, mesh.npz, poses.npz, renders,
          solve.json. Of all of them manifest.json and provenance.json.
 Writes   head.usda with its payload, head.usdz, head.glb, mesh.obj, maps/*.exr, envmap.exr, poses.npz, plates/*.jpg,
-         renders/*.exr, run.json, report.html.
+         renders/*.exr, views/*.exr, run.json, report.html.
 Method   Units, axes, colour spaces and sources are stated on everything that is written; then the asset is validated
          as a stranger would find it on disk.
 Fails    values that are not finite, a mesh with broken indices or UVs, a map that is not a square power of two,
@@ -39,6 +39,8 @@ STAGE = Stage(
         Output("poses.npz", "camera_from_head [F, 4, 4], frame_index [F], intrinsics [3, 3] of the frame", "mm"),
         Output("plates/*.jpg", "the clip's crops, sRGB; absent when plates is off", space="crop", optional=True),
         Output("renders/*.exr", "re-renders in full source frames", colour_space="in each file"),
+        Output("views/*.exr", "novel and relit views, and the lights of the latter; absent when views is off",
+               colour_space="in each file", optional=True),
         Output("run.json", "parameters, model, costs, residuals and warnings of all stages", volatile=True),
         Output("report.html", "the page for people", volatile=True),
     ),
@@ -52,6 +54,8 @@ STAGE = Stage(
         Parameter("usdz", bool, True, "Also pack everything into head.usdz."),
         Parameter("glb", bool, True, "Also write binary glTF."),
         Parameter("plates", bool, True, "Also write the clip's frames, shown behind the head in USD as a guide."),
+        Parameter("views", bool, True, "Also render the head from the side and under other lights."),
+        Parameter("view_size", int, 512, "Edge of those pictures.", "px", 64, 4096),
         Parameter("report_frames", int, 12, "Frames that the report compares.", unit="frames", minimum=1, maximum=60),
     ),
 )
@@ -144,6 +148,24 @@ def write_assets(job: Job, asset, poses: dict, maps: dict, envmap) -> None:
         write_glb(job.out / "head.glb", asset.name, asset.mesh, maps, asset.capture)
 
 
+def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, moves: str):
+    """Writes views/novel_*.exr, views/relit_*.exr and the lights -> the ViewSet; None when switched off."""
+    from shared.solve.views import make_views
+    from shared.studio_lights import STUDIO_LIGHTS, studio_light
+
+    if not job.params.views:
+        return None
+    views = make_views(mesh, maps, envmap, poses["camera_from_head"], moves, job.params.view_size, job.progress)
+    (job.out / "views").mkdir()
+    pictures = {f"novel_{name}": picture for name, picture in views.novel.items()}
+    pictures |= {f"relit_{name}": picture for name, picture in views.relit.items()}
+    for name, picture in pictures.items():
+        writer.write_colour(job.out / "views" / f"{name}.exr", picture, "radiance")
+    for name in STUDIO_LIGHTS:
+        writer.write_colour(job.out / "views" / f"light_{name}.exr", studio_light(name), "radiance", latlong=True)
+    return views
+
+
 def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     """The content of run.json: what each stage was told, what it took, what it found."""
     from shared.mesh_checks import mesh_warnings
@@ -159,7 +181,8 @@ def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
         own["warnings"].append(text)
         warnings.append((STAGE.name, text))
     records[STAGE.name] = own
-    chosen = {key: solve[key] for key in ("model", "residuals", "albedo_scale", "held_out_frames") if key in solve}
+    kept = ("model", "ladder", "residuals", "albedo_scale", "held_out_frames")
+    chosen = {key: solve[key] for key in kept if key in solve}
     return {
         "subject": job.subject.name,
         "stages": records,
@@ -187,11 +210,12 @@ def run(job: Job) -> None:
     write_images(job, writer, maps, envmap, frames, solve["render_frames"])
     asset = describe_asset(job, mesh, describe_capture(job, poses, frames), frames, writer)
     write_assets(job, asset, poses, maps, envmap)
+    views = render_views(job, writer, mesh, maps, envmap, poses, frames.moves)
     record = run_record(job, mesh, solve, time.perf_counter() - start)
     write_json(job.out / "run.json", record)
     folders = {name: job.input(name) for name in STAGE.inputs}
     files = [(output.path, output.help) for output in STAGE.outputs]
-    result = Result(job.subject.name, folders, frames, mesh, poses, maps, envmap, solve, record, files)
+    result = Result(job.subject.name, folders, frames, mesh, poses, maps, envmap, solve, record, files, views)
     page = result_report(result, job.params.report_frames)
     (job.out / "report.html").write_text(page, encoding="utf-8")
 

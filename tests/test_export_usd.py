@@ -19,6 +19,7 @@ from toy_result import (
     MAP_SIZE,
     RENDERED,
     SOURCE_SIZE,
+    VIEW_SIZE,
     ToyJob,
     toy_maps,
     toy_mesh,
@@ -40,6 +41,8 @@ from shared.io.usd_validate import package_errors, usd_errors
 from shared.io.usdz import write_usdz
 from shared.mesh import Mesh, vertex_normals
 from shared.mesh_checks import mesh_errors, mesh_warnings
+from shared.studio_lights import STUDIO_LIGHTS
+from shared.view_set import NOVEL_VIEWS
 from stages import export_usd
 
 NAME = '1st "Zoë" <take> / été'
@@ -97,6 +100,8 @@ def test_every_file_of_the_contract_is_there(exported):
     files = {path.relative_to(exported["head"]).as_posix() for path in exported["head"].rglob("*") if path.is_file()}
     maps = {f"maps/{name}.exr" for name in MAPS}
     pictures = {f"renders/{frame:04d}.exr" for frame in RENDERED} | {f"plates/{frame:04d}.jpg" for frame in FRAMES}
+    pictures |= {f"views/novel_{name}.exr" for name in NOVEL_VIEWS}
+    pictures |= {f"views/{kind}_{name}.exr" for kind in ("relit", "light") for name in STUDIO_LIGHTS}
     layers = {"head.usda", "head_payload.usda", "head_geo.usdc", "head_mtl.usda", "head.usdz", "head.glb"}
     single = {"mesh.obj", "envmap.exr", "poses.npz", "run.json", "report.html"}
     assert files == maps | pictures | layers | single
@@ -449,11 +454,12 @@ def test_udim_names(work, tmp_path):
 
 
 def test_choices_of_format(work, tmp_path):
-    options = {"map_format": "float", "acescg": True, "png_copies": "16", "usdz": False, "glb": False, "plates": False}
+    options = {"map_format": "float", "acescg": True, "png_copies": "16", "usdz": False, "glb": False}
+    options |= {"plates": False, "views": False}
     job = ToyJob(work["head"], tmp_path / "export", **options)
     export_usd.run(job)
     export_usd.check(job)
-    assert not any((job.out / name).exists() for name in ("head.usdz", "head.glb", "plates"))
+    assert not any((job.out / name).exists() for name in ("head.usdz", "head.glb", "plates", "views"))
     assert not Usd.Stage.Open(str(job.out / "head.usda")).GetDefaultPrim().GetPrimAtPath("capture/plate")
     albedo = toy_maps()["diffuse_albedo"]
     np.testing.assert_allclose(read_exr(job.out / "maps" / "diffuse_albedo.exr"), acescg_from_rec709(albedo), atol=1e-6)
@@ -497,6 +503,20 @@ def test_renders_fill_the_source_frame(exported):
     np.testing.assert_allclose(edges, [20 / scale + x0, 70 / scale + x0, 20 / scale + y0, 60 / scale + y0], atol=1.0)
 
 
+def test_views_are_files(exported):
+    """Each picture shows the head before black; the relit ones differ by their light alone."""
+    folder = exported["head"] / "views"
+    pictures = {path.stem: read_exr(path) for path in folder.glob("*.exr")}
+    for name, picture in pictures.items():
+        assert np.isfinite(picture).all() and picture.max() > 0.05, name
+        if not name.startswith("light"):
+            assert picture.shape == (VIEW_SIZE, VIEW_SIZE, 3) and picture[0, 0].max() == 0.0
+    covered = [(pictures[f"relit_{name}"] > 0).any(-1) for name in STUDIO_LIGHTS]
+    assert all((mask == covered[0]).mean() > 0.99 for mask in covered)
+    left, right = (pictures["relit_low_sun"][:, part].sum() for part in (slice(0, 32), slice(32, 64)))
+    assert right > 1.3 * left
+
+
 def test_obj_and_poses_read_back(exported):
     mesh, back = toy_mesh(), read_obj(exported["head"] / "mesh.obj")
     np.testing.assert_allclose(back.vertices, mesh.vertices, atol=1e-4)
@@ -513,7 +533,7 @@ def test_run_record(exported):
     assert record["subject"] == NAME and set(record["stages"]) == {*export_usd.STAGE.inputs, "export_usd"}
     assert record["stages"]["inverse_render"]["wall_s"] == 1.5
     assert record["stages"]["sample_frames"]["parameters"] == {"size": 64}
-    assert record["residuals"] == {"fitted": 0.021, "held_out": 0.023}
+    assert record["residuals"]["held_out"] == 0.023 and record["model"]["light"] == "cubemap 16"
     assert {"stage": "sample_frames", "text": "the focal length is not given"} in record["warnings"]
 
 

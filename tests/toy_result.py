@@ -20,7 +20,7 @@ FRAMES = np.array([3, 5, 8, 12, 13])
 RENDERED = [3, 8, 13]
 SOURCE_SIZE, CROP_SIZE, CROP = (160, 120), (96, 88), (20.0, 8.0, 0.8)
 INTRINSICS = np.array([[300.0, 0.0, 71.0], [0.0, 310.0, 66.0], [0.0, 0.0, 1.0]])
-MAP_SIZE = 16
+MAP_SIZE, VIEW_SIZE = 16, 64
 
 
 def toy_mesh():
@@ -104,8 +104,12 @@ def _write_solution(folder: Path) -> None:
         render[20:60, 20:70] = [0.4, 0.3, 0.25]
         write_exr(folder / "renders" / f"{frame:06d}.exr", render, colour_space="lin_rec709_scene")
     solve = {
-        "model": {"light": "cubemap 16"}, "residuals": {"fitted": 0.021, "held_out": 0.023},
-        "iterations": [{"fitted": 0.05, "held_out": 0.06}, {"fitted": 0.021, "held_out": 0.023}],
+        "model": {"light": "cubemap 16", "specular_variation": "one value"},
+        "residuals": {"fitted": 0.021, "held_out": 0.023, "texture_held_out": {"one value": 0.02, "16 texels": 0.03}},
+        "iterations": [
+            {"light": "cubemap", "resolution": 8, "step": 0, "fitted": 0.05, "held_out": 0.06},
+            {"light": "cubemap", "resolution": 16, "step": 0, "fitted": 0.021, "held_out": 0.023},
+        ],
         "albedo_scale": {"factor": [1.0, 1.0, 1.0]}, "held_out_frames": [8], "warnings": [], "render_frames": RENDERED,
     }
     write_json(folder / "solve.json", solve)
@@ -116,7 +120,7 @@ class ToyJob:
 
     def __init__(self, work: Path, out: Path, name: str = "toy", **parameters):
         out.mkdir(parents=True)
-        self.params = Parameters(STAGE.defaults() | parameters)
+        self.params = Parameters(STAGE.defaults() | {"view_size": VIEW_SIZE} | parameters)
         self.subject = SimpleNamespace(name=name, sensor_width_mm=22.3, focal_length_mm=None)
         self.out, self._work, self.warnings = out, work, []
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import OpenEXR
-import OpenImageIO
 
 from shared.errors import InputError, LimnError
 
@@ -74,6 +73,8 @@ def _one_level() -> OpenEXR.TileDescription:
 
 def _write_mipmaps(path: Path | str, pixels: np.ndarray, header: dict) -> None:
     """Through OpenImageIO: the OpenEXR binding writes mip levels that nothing can read."""
+    import OpenImageIO  # only this needs it
+
     planes = pixels if pixels.ndim == 3 else pixels[..., None]
     height, width, channels = planes.shape
     kind = "half" if pixels.dtype == np.float16 else "float"

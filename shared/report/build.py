@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shared.io.export_maps import SOLVED_MAPS
 from shared.io.frames import FrameSet
 from shared.io.images import read_png
 from shared.mesh import Mesh
@@ -15,13 +16,15 @@ from shared.report.content import Cost, ReportContent
 from shared.report.gather import chosen_frames, compared_frames, excluded_frames, motion
 from shared.report.page import report_html
 from shared.report.sections import number
+from shared.view_set import ViewSet
 
 
 @dataclass(frozen=True)
 class Result:
     """What the export holds in memory while it writes: the report's raw material.
 
-    folders {stage: folder} of the stages before it; record: the content of run.json; files: (name, text) pairs.
+    folders {stage: folder} of the stages before it; record: the content of run.json; files: (name, text) pairs; views:
+    None when they were not wished.
     """
 
     name: str
@@ -34,6 +37,7 @@ class Result:
     solve: Mapping[str, object]
     record: Mapping[str, object]
     files: Sequence[tuple[str, str]]
+    views: ViewSet | None = None
 
 
 def result_report(result: Result, frame_count: int) -> str:
@@ -50,8 +54,9 @@ def result_report(result: Result, frame_count: int) -> str:
         facts=_facts(frames),
         numbers=_numbers(angles, len(excluded), record),
         frames=compared_frames(frames, solved / "renders", chosen, held_out),
-        maps=result.maps,
+        maps={name: result.maps[name] for name in SOLVED_MAPS},
         envmap=result.envmap,
+        views=result.views,
         mesh=result.mesh,
         frame_index=poses["frame_index"],
         angles_deg=angles,
@@ -59,6 +64,7 @@ def result_report(result: Result, frame_count: int) -> str:
         overlay=read_png(overlay) if overlay.is_file() else None,
         excluded=excluded,
         model={**solve.get("model", {}), "albedo_scale": solve.get("albedo_scale")},
+        ladder=solve.get("ladder", ()),
         residuals=solve.get("residuals", {}),
         iterations=solve.get("iterations", []),
         costs=[_cost(name, values) for name, values in record["stages"].items()],

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from shared.mesh import Mesh
+from shared.view_set import ViewSet
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,9 @@ class ReportContent:
 
     facts, numbers, files: (label, value) pairs. maps {name: [S, S] or [S, S, 3]}, envmap [H, W, 3] linear.
     angles_deg [F, 3] yaw, pitch, roll and position_mm [F, 3] at frame_index [F]. excluded: (frame, stage, reason).
-    residuals: nested dictionaries of numbers. iterations: one dictionary of numbers each. warnings: (stage, text).
-    parameters: (stage, name, value).
+    views: None when they were not wished. ladder: the models tried, one dictionary each, in order. residuals: nested
+    dictionaries of numbers. iterations: one dictionary of numbers each. warnings: (stage, text). parameters: (stage,
+    name, value).
     """
 
     name: str
@@ -55,8 +57,10 @@ class ReportContent:
     frame_index: np.ndarray
     angles_deg: np.ndarray
     position_mm: np.ndarray
+    views: ViewSet | None = None
     overlay: np.ndarray | None = None
     excluded: Sequence[tuple[int, str, str]] = ()
+    ladder: Sequence[Mapping[str, object]] = ()
     model: Mapping[str, object] = field(default_factory=dict)
     residuals: Mapping[str, object] = field(default_factory=dict)
     iterations: Sequence[Mapping[str, float]] = ()

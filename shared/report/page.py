@@ -10,7 +10,7 @@ from string import Template
 import numpy as np
 
 from shared.mesh import vertex_normals
-from shared.report import sections
+from shared.report import model_sections, sections, view_sections
 from shared.report.content import ReportContent
 from shared.report.pictures import jpeg_uri, shrunk, srgb_bytes
 from shared.report.viewer import irradiance_harmonics, packed, reduced
@@ -37,11 +37,15 @@ def report_html(content: ReportContent) -> str:
         ("frames", "Clip and re-render", sections.comparison_section(frames)),
         ("maps", "Maps", sections.map_section(content.maps)),
         ("view", "In the round", _VIEWER),
+        ("novel", "Novel views", view_sections.novel_section(content.views)),
+        ("relit", "Other lights", view_sections.relit_section(content.views)),
+        ("visibility", "Visibility", view_sections.visibility_section(content.views)),
         ("light", "Light", sections.light_section(content.envmap)),
         ("poses", "Motion", sections.pose_section(content)),
         ("tracking", "Tracking", sections.tracking_section(content.overlay)),
         ("excluded", "Frames left out", sections.excluded_section(content.excluded)),
-        ("residuals", "Residuals and model", sections.residual_section(content)),
+        ("residuals", "Residuals", model_sections.residual_section(content, frames)),
+        ("ladder", "Models tried", model_sections.ladder_section(content)),
         ("cost", "Time and memory", sections.cost_section(content)),
         ("parameters", "Parameters", sections.parameter_section(content)),
         ("files", "Files", sections.table(("file", "what"), content.files)),

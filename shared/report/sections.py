@@ -55,21 +55,23 @@ def figure(uri: str, alt: str, caption: str = "", *, element_id: str = "", zoom:
 
 
 def comparison_frame(frame: Frame) -> dict:
-    """For the slider: {"clip", "render", "error": data URIs, "label": text}."""
+    """For the slider: {"clip", "render", "error": data URIs, "label": text, "psnr": dB or None, "held_out"}."""
     covered = (frame.render > 0.0).any(-1).astype(np.uint8)
     inside = cv2.erode(covered, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE) > 0
     clip, render = srgb_bytes(frame.clip), srgb_bytes(frame.render)
     judged = inside & ~frame.clipped
     difference = (clip[judged].astype(np.float64) - render[judged]) / 255.0
     mean_square = float((difference**2).mean()) if difference.size else 0.0
-    psnr = f", PSNR {-10 * np.log10(mean_square):.1f} dB" if mean_square > 0.0 else ""
+    psnr = float(-10 * np.log10(mean_square)) if mean_square > 0.0 else None
     kind = "held out" if frame.held_out else "fitted"
     error = error_bytes(frame.clip, frame.render, frame.clipped)
     return {
         "clip": jpeg_uri(shrunk(clip, FRAME_PIXELS)),
         "render": jpeg_uri(shrunk(render, FRAME_PIXELS)),
         "error": jpeg_uri(shrunk(error, FRAME_PIXELS)),
-        "label": f"frame {frame.frame_index}, {frame.time_s:.2f} s, {kind}{psnr}",
+        "label": f"frame {frame.frame_index}, {frame.time_s:.2f} s, {kind}{f', PSNR {psnr:.1f} dB' if psnr else ''}",
+        "psnr": psnr,
+        "held_out": frame.held_out,
     }
 
 
@@ -194,30 +196,6 @@ def number(value: object) -> str:
     if isinstance(value, (list, tuple)):
         return ", ".join(number(item) for item in value)
     return str(value)
-
-
-def residual_section(content: ReportContent) -> str:
-    """Residuals on fitted and held-out frames, their course, and the model that was chosen."""
-    parts = [table(("residual", "value"), [(k, number(v)) for k, v in flat(content.residuals)], numbers=(1,))]
-    curves = _curves(content.iterations)
-    if curves:
-        steps = range(1, len(content.iterations) + 1)
-        parts.append(line_chart(steps, curves, x_label="iteration", y_label="residual", from_zero=True))
-    if content.model:
-        parts.append(f"<h3>Model</h3>{table(('part', 'choice'), [(k, number(v)) for k, v in flat(content.model)])}")
-    return "".join(parts)
-
-
-def _curves(iterations: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
-    """fitted and held_out of each iteration, where there are at least two."""
-    if len(iterations) < 2:
-        return {}
-    names = [name for name in ("fitted", "held_out") if any(name in step for step in iterations)]
-    missing = float("nan")
-    return {
-        name.replace("_", " "): [missing if step.get(name) is None else float(step[name]) for step in iterations]
-        for name in names
-    }
 
 
 def cost_section(content: ReportContent) -> str:

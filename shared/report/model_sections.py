@@ -1,0 +1,88 @@
+"""Sections of the report on what was solved: the ladder of models, residuals, the model that was chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+
+import numpy as np
+
+from shared.report.charts import line_chart
+from shared.report.content import ReportContent
+from shared.report.sections import flat, number, table
+
+
+def ladder_section(content: ReportContent) -> str:
+    """The models that were tried, in order, each with its error on held-out frames."""
+    rungs = content.ladder or solved_rungs(content.iterations, content.residuals, content.model)
+    if not rungs:
+        return "<p>Nothing was recorded.</p>"
+    columns = list(dict.fromkeys(key for rung in rungs for key in rung))
+    rows = [[number(rung.get(column)) for column in columns] for rung in rungs]
+    numeric = [k for k, column in enumerate(columns)
+               if all(isinstance(rung.get(column), (int, float, type(None))) for rung in rungs)]
+    chosen = f"<h3>Chosen</h3>{table(('part', 'choice'), [(k, number(v)) for k, v in flat(content.model)])}"
+    return table([column.replace("_", " ") for column in columns], rows, numbers=numeric) + chosen
+
+
+def solved_rungs(
+    iterations: Sequence[Mapping], residuals: Mapping[str, object], model: Mapping[str, object]
+) -> list[dict]:
+    """Rungs from what the solver logged: one per light model and resolution, one per width of the gloss.
+
+    Errors are those of the last step of each; chosen: where model names it.
+    """
+    rungs = []
+    for (light, resolution), steps in groupby(iterations, key=lambda step: (step.get("light"), step.get("resolution"))):
+        steps = [step for step in steps if not step.get("undone")]
+        if light is None or not steps:
+            continue
+        name = f"light, {light} {resolution}" if resolution else f"light, {light}"
+        chosen = f"6 x {resolution}^2" in str(model.get("light", "")) or model.get("light") == light
+        rungs.append({"model": name, "steps": len(steps), "fitted": steps[-1].get("fitted"),
+                      "held_out": min(step["held_out"] for step in steps), "chosen": chosen})
+    tried = residuals.get("texture_held_out")
+    for name, error in (tried.items() if isinstance(tried, Mapping) else ()):
+        chosen = name == model.get("specular_variation")
+        rungs.append({"model": f"gloss over the map, {name}", "steps": None, "fitted": None, "held_out": error,
+                      "chosen": chosen})
+    return rungs
+
+
+def residual_section(content: ReportContent, frames: Sequence[Mapping]) -> str:
+    """Errors on fitted and on held-out frames side by side, the solver's and the pictures', and their course.
+
+    frames: the compared ones, with "psnr" (dB or None) and "held_out".
+    """
+    rows = []
+    pair = [content.residuals.get(name) for name in ("fitted", "held_out")]
+    if any(isinstance(value, (int, float)) for value in pair):
+        rows.append(("light and gloss, at sample points (share of full scale)", *map(number, pair)))
+    known = [frame for frame in frames if frame["psnr"] is not None]
+    kinds = [[frame["psnr"] for frame in known if frame["held_out"] == held] for held in (False, True)]
+    shown = [f"{np.mean(values):.1f}" if values else "-" for values in kinds]
+    rows.append(("re-renders on this page (PSNR, dB)", *shown))
+    parts = [table(("error", "fitted frames", "held-out frames"), rows, numbers=(1, 2))]
+    said = ("fitted", "held_out", "texture_held_out")  # the last stands among the models tried
+    rest = {key: value for key, value in content.residuals.items() if key not in said}
+    if rest:
+        parts.append(table(("residual", "value"), [(k, number(v)) for k, v in flat(rest)], numbers=(1,)))
+    curves = _curves(content.iterations)
+    if curves:
+        steps = range(1, len(content.iterations) + 1)
+        parts.append(line_chart(steps, curves, x_label="iteration", y_label="residual", from_zero=True))
+    parts.append('<p class="note">Held-out frames took no part in the fit. Much larger errors there mean that poses or '
+                 "shape are off, or that the light changed.</p>")
+    return "".join(parts)
+
+
+def _curves(iterations: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
+    """fitted and held_out of each iteration, where there are at least two."""
+    if len(iterations) < 2:
+        return {}
+    names = [name for name in ("fitted", "held_out") if any(name in step for step in iterations)]
+    missing = float("nan")
+    return {
+        name.replace("_", " "): [missing if step.get(name) is None else float(step[name]) for step in iterations]
+        for name in names
+    }

@@ -1,0 +1,167 @@
+"""A solved head from where no camera stood, and under light that no clip had; what it covers of itself.
+
+The scenery is traced once; a view needs a camera, a relit picture a light. Everything happens in head space: the light
+is turned into it, and the head stays where it is ("moves: camera" to the shading).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from shared.envmap import cube_from_latlong, latlong_directions, latlong_lookup
+from shared.gather import SurfaceViewer
+from shared.geometry import rigid, world_from_head
+from shared.mesh import Mesh, interpolate, normalised
+from shared.raycast import RayScene, camera_hits
+from shared.render import SurfaceMaps, render_frame
+from shared.shading import Material, VertexShading
+from shared.solve.capture import Sizes, set_scenery
+from shared.split_sum import SplitSum
+from shared.studio_lights import STUDIO_LIGHTS, studio_light
+from shared.texture import sample_bilinear
+from shared.transfer import Transfer, mesh_points
+from shared.view_set import NOVEL_VIEWS, ROUGHNESSES, ViewSet
+
+DISTANCE_MM, FILLED = 900.0, 0.86
+"""The virtual camera's distance from the head's middle, and the share of the picture that the head fills."""
+LIGHT_RESOLUTION, VIEW_SIZES = 16, Sizes(directions=640, nodes=500)
+ORIENTATION_MM = 40.0
+RELIT_YAW_DEG = -15.0
+
+
+def make_views(
+    mesh: Mesh,
+    maps: Mapping[str, np.ndarray],
+    envmap: np.ndarray,
+    camera_from_head: np.ndarray,
+    moves: str,
+    pixels: int,
+    progress: Callable | None = None,
+) -> ViewSet:
+    """All of them, pixels wide. maps and progress as for HeadViews; envmap [H, 2 H, 3], camera_from_head [F, 4, 4] and
+    moves of the clip."""
+    views = HeadViews(mesh, maps, VIEW_SIZES, progress)
+    light = clip_light(envmap, camera_from_head, moves)
+    novel = views.render(light, [orbit_camera(mesh, *place, pixels) for place in NOVEL_VIEWS.values()])
+    camera, front = orbit_camera(mesh, RELIT_YAW_DEG, 0.0, pixels), orbit_camera(mesh, 0.0, 0.0, pixels)
+    return ViewSet(
+        dict(zip(NOVEL_VIEWS, novel, strict=True)),
+        {name: views.render(studio_light(name), [camera])[0] for name in STUDIO_LIGHTS},
+        {roughness: views.visibility(front, roughness) for roughness in ROUGHNESSES},
+    )
+
+
+@dataclass(frozen=True)
+class Camera:
+    """camera_from_head [4, 4] mm, intrinsics [3, 3] px of a picture of size (width, height)."""
+
+    camera_from_head: np.ndarray
+    intrinsics: np.ndarray
+    size: tuple[int, int]
+
+
+def orbit_camera(mesh: Mesh, yaw_deg: float, pitch_deg: float, pixels: int) -> Camera:
+    """A camera that looks at the head's middle from yaw (90: its left, the picture's right seen from the front) and
+    pitch (90: above), a square picture of the given size."""
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    middle, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm((high - low)[:2]))
+    yaw, pitch = np.radians([yaw_deg, pitch_deg])
+    back = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
+    right = np.array([np.cos(yaw), 0.0, -np.sin(yaw)])
+    rotation = np.stack([right, np.cross(right, back), -back])  # x right, y down, z forward
+    focal = FILLED * pixels / 2 * DISTANCE_MM / radius
+    intrinsics = np.array([[focal, 0.0, pixels / 2], [0.0, focal, pixels / 2], [0.0, 0.0, 1.0]])
+    return Camera(rigid(rotation, -rotation @ (middle + DISTANCE_MM * back)), intrinsics, (pixels, pixels))
+
+
+def frontal_frame(camera_from_head: np.ndarray) -> int:
+    """Index of the frame in which the face looks most directly into the camera. camera_from_head [F, 4, 4]."""
+    towards = -camera_from_head[:, :3, 3] / np.linalg.norm(camera_from_head[:, :3, 3], axis=1, keepdims=True)
+    return int(np.argmax((camera_from_head[:, :3, 2] * towards).sum(1)))
+
+
+def light_in_head_space(envmap: np.ndarray, world_from_head_: np.ndarray) -> np.ndarray:
+    """Lat-long radiance in the world [H, 2 H, 3], rotation [3, 3] -> the same light as the head sees it."""
+    return latlong_lookup(envmap, latlong_directions(len(envmap)) @ world_from_head_.T)
+
+
+class HeadViews:
+    """Pictures of one solved head.
+
+    maps: diffuse_albedo [S, S, 3], specular_intensity [S, S], roughness [S, S]. progress(items, label) wraps the trace.
+    """
+
+    def __init__(
+        self, mesh: Mesh, maps: Mapping[str, np.ndarray], sizes: Sizes | None = None, progress: Callable | None = None
+    ):
+        self.viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
+        self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"])
+        self.scenery = set_scenery(self.viewer, sizes or Sizes())
+        self.points = mesh_points(mesh)
+        wrap = progress or (lambda items, label: items)
+        self.transfer: Transfer = self.scenery.trace(self.points, lambda items: wrap(items, "visibility"))
+        self.material = self._bounce_material(mesh, maps)
+        # What stands in for a point deep in a cavity is the nearest one in the open. Seen from inside the mouth that
+        # can be the outside of the cheek, unless orientation counts as well.
+        self._surface_place = np.concatenate([mesh.vertices, ORIENTATION_MM * self.points.normals], axis=1)
+
+    def _bounce_material(self, mesh: Mesh, maps: Mapping[str, np.ndarray]) -> Material:
+        """What light that bounces meets: the maps at the nodes."""
+        uv = np.zeros((len(mesh.vertices), 2))
+        uv[mesh.faces.ravel()] = mesh.uvs[mesh.face_uvs.ravel()]
+        nearest = cKDTree(mesh.vertices).query(self.scenery.nodes.points.positions)[1]
+        albedo = sample_bilinear(maps["diffuse_albedo"], uv[nearest])
+        gloss = float(np.median(sample_bilinear(maps["specular_intensity"], uv)))
+        return Material(albedo, gloss, float(np.median(sample_bilinear(maps["roughness"], uv))))
+
+    def render(self, light: np.ndarray, cameras: Sequence[Camera]) -> list[np.ndarray]:
+        """Lat-long radiance in head space [H, 2 H, 3] -> a linear picture [h, w, 3] per camera, 0 beside the head."""
+        poses = np.stack([camera.camera_from_head for camera in cameras])
+        shading = VertexShading(
+            np.arange(len(self.points)),
+            self._surface_place,
+            self.points,
+            self.transfer,
+            self.scenery.node_transfer,
+            self.material,
+            np.maximum(cube_from_latlong(light, LIGHT_RESOLUTION), 0.0),
+            self.scenery.directions,
+            poses,
+            "camera",
+            key_step=0.0,
+        )
+        pictures = []
+        for k, camera in enumerate(cameras):
+            picture, covered = render_frame(
+                self.viewer, shading, self.maps, k, camera.camera_from_head, camera.intrinsics, camera.size
+            )
+            pictures.append(picture * covered[..., None])
+        return pictures
+
+    def visibility(self, camera: Camera, roughness: float) -> np.ndarray:
+        """[h, w]: share of a lobe of this roughness about the reflected direction that the head leaves open; NaN beside
+        the head. 1 where nothing covers it; for rough lobes it nears the sky's open share."""
+        vertices, normals = self.viewer.mesh.vertices, self.points.normals
+        centre = -camera.camera_from_head[:3, 3] @ camera.camera_from_head[:3, :3]
+        towards = normalised(centre - vertices)
+        facing = np.nonzero((towards * normals).sum(1) > 0.0)[0]
+        share = np.ones(len(vertices))
+        visible = self.transfer.visibility(facing)
+        share[facing] = SplitSum(self.scenery.directions).visible_share(
+            normals[facing], towards[facing], roughness, visible
+        )
+        face, bary, _ = camera_hits(self.viewer.scene, camera.camera_from_head, camera.intrinsics, *camera.size)
+        hit = face >= 0
+        picture = np.full(face.shape, np.nan)
+        picture[hit] = interpolate(share, self.viewer.mesh.faces, face[hit], bary[hit])
+        return picture
+
+
+def clip_light(envmap: np.ndarray, camera_from_head: np.ndarray, moves: str) -> np.ndarray:
+    """The recovered light as the head saw it when it looked into the camera: lat-long in head space."""
+    turned = world_from_head(camera_from_head[None, frontal_frame(camera_from_head)], moves)[0]
+    return light_in_head_space(envmap, turned)

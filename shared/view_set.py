@@ -1,0 +1,21 @@
+"""Which views of a solved head there are, apart from the code that renders them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+NOVEL_VIEWS = {"left": (-50.0, 0.0), "right": (50.0, 0.0), "above": (0.0, 30.0), "below": (0.0, -25.0)}
+"""name -> yaw and pitch of the camera in degrees; right is the picture's right of a face seen from the front."""
+ROUGHNESSES = (0.1, 0.3, 0.5, 0.8)
+
+
+@dataclass(frozen=True)
+class ViewSet:
+    """Pictures [h, w, 3], linear, 0 beside the head: novel {name of NOVEL_VIEWS} under the clip's light, relit {name of
+    studio_lights.STUDIO_LIGHTS}; visibility {roughness: [h, w], NaN beside the head}."""
+
+    novel: dict[str, np.ndarray]
+    relit: dict[str, np.ndarray]
+    visibility: dict[float, np.ndarray]
