@@ -162,7 +162,7 @@ def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, moves:
     for name, picture in pictures.items():
         writer.write_colour(job.out / "views" / f"{name}.exr", picture, "radiance")
     for name in STUDIO_LIGHTS:
-        writer.write_colour(job.out / "views" / f"light_{name}.exr", studio_light(name), "radiance", latlong=True)
+        writer.write_colour(job.out / "views" / f"relit_{name}_light.exr", studio_light(name), "radiance", latlong=True)
     return views
 
 

@@ -101,7 +101,7 @@ def test_every_file_of_the_contract_is_there(exported):
     maps = {f"maps/{name}.exr" for name in MAPS}
     pictures = {f"renders/{frame:04d}.exr" for frame in RENDERED} | {f"plates/{frame:04d}.jpg" for frame in FRAMES}
     pictures |= {f"views/novel_{name}.exr" for name in NOVEL_VIEWS}
-    pictures |= {f"views/{kind}_{name}.exr" for kind in ("relit", "light") for name in STUDIO_LIGHTS}
+    pictures |= {f"views/relit_{name}{kind}.exr" for kind in ("", "_light") for name in STUDIO_LIGHTS}
     layers = {"head.usda", "head_payload.usda", "head_geo.usdc", "head_mtl.usda", "head.usdz", "head.glb"}
     single = {"mesh.obj", "envmap.exr", "poses.npz", "run.json", "report.html"}
     assert files == maps | pictures | layers | single
@@ -509,7 +509,7 @@ def test_views_are_files(exported):
     pictures = {path.stem: read_exr(path) for path in folder.glob("*.exr")}
     for name, picture in pictures.items():
         assert np.isfinite(picture).all() and picture.max() > 0.05, name
-        if not name.startswith("light"):
+        if not name.endswith("light"):
             assert picture.shape == (VIEW_SIZE, VIEW_SIZE, 3) and picture[0, 0].max() == 0.0
     covered = [(pictures[f"relit_{name}"] > 0).any(-1) for name in STUDIO_LIGHTS]
     assert all((mask == covered[0]).mean() > 0.99 for mask in covered)

@@ -1,24 +1,51 @@
-"""What a person can do about a warning: a table from words in the warning to a remedy."""
+"""What a person can do about a warning: a table from words in the warning to a remedy.
+
+The first pattern that is found decides, so those of single warnings stand before those of whole families.
+"""
 
 from __future__ import annotations
 
 import re
 
 _ADVICE = (
+    (r"tracks ask for a focal length",
+     "Correct the lens in subject.yaml; cropping and stabilisation in the camera lengthen it too."),
     (r"focal|lens|sensor", "Give the lens in subject.yaml (camera: focal_length_mm and sensor_width_mm)."),
+    (r"faces in the clip",
+     "Look at the contact sheet; if it shows the wrong person, crop the clip or film one person."),
+    (r"beyond the picture's edge", "Film again with room around the head: what leaves the picture has no texture."),
+    (r"brightness wanders|flicker",
+     "Lock the exposure and keep the light still; maps from this clip average over its changes."),
+    (r"held out fit worse",
+     "Look at Motion and at the error maps for frames that stand out; film with a still light, or leave such frames "
+     "out by a higher sample_frames.blurred_below."),
+    (r"explains the clip poorly",
+     "Look at the error maps: large even areas mean that the light changed or moved along, edges that the shape is "
+     "off. Film again if the face itself is red or blue."),
+    (r"no colour", "Give the original in colour: only brightness can be solved from this one."),
+    (r"HDR|BT.2020", "Convert the clip to Rec.709 first, or to linear EXR images with colour: transfer: linear."),
+    (r"are linear|transfer", "Set colour: transfer in subject.yaml to what the camera wrote."),
+    (r"colour matrix", "Nothing to do if skin looks right here; else convert the clip with its matrix stated."),
+    (r"interlaced", "Film progressive, or de-interlace first: ffmpeg -i IN -vf bwdif -c:v libx264 -crf 12 OUT.mp4."),
+    (r"alpha", "Nothing to do if the pictures are meant to be opaque."),
+    (r"numbers are missing", "Give all frames of the shot: gaps count as dropped frames."),
     (r"clipp|overexpos|saturat", "Film darker by a stop or two: clipped skin tells only that it is bright."),
     (r"underexpos|too dark|crushed", "Film brighter, or add light; noise in the dark parts ends up in the maps."),
     (r"behind|not determined|no highlight|confidence",
      "Nothing in the clip shows this. Film a wider turn, or treat maps and light there as a guess."),
-    (r"turn|rotat|yaw|parallax|view change",
+    (r"around the mouth|expression|smil|blink",
+     "Film again with a relaxed, closed mouth and a steady gaze, without talking."),
+    (r"view of the head|turn|rotat|yaw|parallax",
      "Film a turn of at least 30 degrees to each side; depth and highlights come from it."),
+    (r"px high|resolution|pixels wide|px wide", "Fill more of the frame with the head: 600 pixels or more are good."),
+    (r"few frames|usable frames", "Film for 5 to 20 seconds; sample_frames.blurred_below=0 keeps blurred frames."),
+    (r"do not fit|left out", "See the list of frames left out: the reasons say whether to film more slowly, or without "
+     "hands and hair before the face."),
+    (r"duplicat|dropped|cut", "Give the untouched camera file, without edits or changes of frame rate."),
     (r"blur|sharpness|focus|jump", "Turn more slowly, with a shorter exposure, and keep the face in focus."),
-    (r"duplicat|dropped frame|cut", "Give the untouched camera file, without edits or changes of frame rate."),
-    (r"expression|smil|mouth|blink", "Film again with a relaxed, closed mouth and a steady gaze."),
-    (r"short|few frames|only \d+ frames", "Film for 5 to 20 seconds."),
-    (r"small|resolution|pixels wide|px wide", "Fill more of the frame with the head: 600 pixels or more are good."),
     (r"scale|prior|reflectance|chart", "Show a grey card or colour chart in the clip to fix the scale."),
-    (r"edge|face[s]? have no area|winding|degenerate", "Clean the mesh in a modelling program if it matters there."),
+    (r"edges (are shared|join)|faces have no area|winding|degenerate",
+     "Clean the mesh in a modelling program if it matters there."),
 )
 _OTHERWISE = "Compare clip and re-render: where they agree, the result can be used."
 
