@@ -14,8 +14,10 @@ ROUGHNESSES = (0.1, 0.3, 0.5, 0.8)
 @dataclass(frozen=True)
 class ViewSet:
     """Pictures [h, w, 3], linear, 0 beside the head: novel {name of NOVEL_VIEWS} under the clip's light, relit {name of
-    studio_lights.STUDIO_LIGHTS}; visibility {roughness: [h, w], NaN beside the head}."""
+    studio_lights.STUDIO_LIGHTS}; visibility {roughness: [h, w], NaN beside the head}; held_out {frame: re-render of a
+    crop of the clip that took no part in the fit}."""
 
     novel: dict[str, np.ndarray]
     relit: dict[str, np.ndarray]
     visibility: dict[float, np.ndarray]
+    held_out: dict[int, np.ndarray]

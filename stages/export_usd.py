@@ -61,6 +61,8 @@ STAGE = Stage(
 )
 
 SMALLEST_HEAD_MM, LARGEST_HEAD_MM = 100.0, 800.0
+HELD_OUT_SHOWN = 4
+"""Held-out frames that the report re-renders beside the others."""
 
 
 def read_maps(folder: Path) -> dict:
@@ -102,7 +104,8 @@ def describe_capture(job: Job, poses: dict, frames):
     if job.subject.sensor_width_mm is not None and job.subject.focal_length_mm is not None:
         film_width = job.subject.focal_length_mm * width / float(intrinsics[0, 0])  # right for turned clips too
     return Capture(poses["camera_from_head"], poses["frame_index"], fps=frames.fps, intrinsics=intrinsics, width=width,
-                   height=height, moves=frames.moves, film_width_mm=film_width)
+                   height=height, moves=frames.moves, film_width_mm=film_width,
+                   light_with_camera=light_moves(job, frames.moves) != frames.moves)
 
 
 def describe_asset(job: Job, mesh, capture, frames, writer):
@@ -148,14 +151,33 @@ def write_assets(job: Job, asset, poses: dict, maps: dict, envmap) -> None:
         write_glb(job.out / "head.glb", asset.name, asset.mesh, maps, asset.capture)
 
 
-def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, moves: str):
+def light_moves(job: Job, moves: str) -> str:
+    """What moves against the light: a lamp at the camera goes with it, in whatever capture."""
+    return "head" if job.manifest("inverse_render")["parameters"].get("light_model") == "camera" else moves
+
+
+def held_out_cameras(poses: dict, frames, solve: dict) -> dict:
+    """{frame: Camera} of a few held-out frames that inverse_render did not re-render."""
+    from shared.solve.capture import spread_frames
+    from shared.solve.views import Camera
+
+    place = {int(frame): f for f, frame in enumerate(poses["frame_index"])}
+    done = set(solve["render_frames"])
+    rest = [frame for frame in solve.get("held_out_frames", ()) if frame in place and frame not in done]
+    chosen = [rest[i] for i in spread_frames(len(rest), HELD_OUT_SHOWN)] if rest else []
+    return {frame: Camera(poses["camera_from_head"][place[frame]], frames.intrinsics, frames.size) for frame in chosen}
+
+
+def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, frames, solve: dict):
     """Writes views/novel_*.exr, views/relit_*.exr and the lights -> the ViewSet; None when switched off."""
     from shared.solve.views import make_views
     from shared.studio_lights import STUDIO_LIGHTS, studio_light
 
     if not job.params.views:
         return None
-    views = make_views(mesh, maps, envmap, poses["camera_from_head"], moves, job.params.view_size, job.progress)
+    cameras, moves = held_out_cameras(poses, frames, solve), light_moves(job, frames.moves)
+    clip = envmap, poses["camera_from_head"], moves
+    views = make_views(mesh, maps, *clip, job.params.view_size, cameras, job.progress)
     (job.out / "views").mkdir()
     pictures = {f"novel_{name}": picture for name, picture in views.novel.items()}
     pictures |= {f"relit_{name}": picture for name, picture in views.relit.items()}
@@ -210,7 +232,7 @@ def run(job: Job) -> None:
     write_images(job, writer, maps, envmap, frames, solve["render_frames"])
     asset = describe_asset(job, mesh, describe_capture(job, poses, frames), frames, writer)
     write_assets(job, asset, poses, maps, envmap)
-    views = render_views(job, writer, mesh, maps, envmap, poses, frames.moves)
+    views = render_views(job, writer, mesh, maps, envmap, poses, frames, solve)
     record = run_record(job, mesh, solve, time.perf_counter() - start)
     write_json(job.out / "run.json", record)
     folders = {name: job.input(name) for name in STAGE.inputs}

@@ -35,8 +35,8 @@ from shared.io.export_maps import MAPS, acescg_from_rec709, paste_crop
 from shared.io.images import read_exr, read_png, write_exr
 from shared.io.meshes import read_obj
 from shared.io.usd import VARIANT_SET, VARIANT_STILL, prim_name
-from shared.io.usd_capture import Capture
-from shared.io.usd_material import modulated_ior
+from shared.io.usd_capture import Capture, define_camera, define_dome_light
+from shared.io.usd_material import Texture, modulated_ior
 from shared.io.usd_validate import package_errors, usd_errors
 from shared.io.usdz import write_usdz
 from shared.mesh import Mesh, vertex_normals
@@ -217,6 +217,17 @@ def test_light_stands_still_while_the_head_turns(exported, moves):
         assert light.ComputeLocalToWorldTransform(float(frame)) == Gf.Matrix4d(1.0)
         turned = np.array(mesh.ComputeLocalToWorldTransform(float(frame))).T[:3, :3]
         np.testing.assert_allclose(turned, expected, atol=1e-12)
+
+
+def test_a_lamp_at_the_camera_goes_with_it():
+    capture = Capture(toy_poses(), FRAMES, 25.0, INTRINSICS, *SOURCE_SIZE, "camera", light_with_camera=True)
+    stage = Usd.Stage.CreateInMemory()
+    light = define_dome_light(stage, "/light", Texture("./envmap.exr"), capture)
+    camera = define_camera(stage, "/camera", capture)
+    for frame in FRAMES:
+        first, second = (prim.ComputeLocalToWorldTransform(float(frame)) for prim in (light, camera))
+        np.testing.assert_allclose(np.array(first)[:3, :3], np.array(second)[:3, :3], atol=1e-12)
+    assert not np.allclose(np.array(first)[:3, :3], np.eye(3), atol=0.01)
 
 
 def test_dome_light_layout_is_that_of_the_environment_map():

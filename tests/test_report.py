@@ -98,8 +98,11 @@ def test_page_says_what_was_found(page):
 def test_data_of_the_slider(page):
     text = page.read_text(encoding="utf-8")
     data = json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S).group(1))
-    assert [frame["label"].split(",")[0] for frame in data["frames"]] == ["frame 3", "frame 8", "frame 13"]
+    assert [frame["label"].split(",")[0] for frame in data["frames"]] == [
+        "frame 3", "frame 5", "frame 8", "frame 13"]
+    assert [frame["held_out"] for frame in data["frames"]] == [False, True, True, False]
     assert "held out" in data["frames"][1]["label"] and "fitted" in data["frames"][0]["label"]
+    assert all(frame["psnr"] > 1.0 for frame in data["frames"])
     assert data["viewer"]["mesh"]["count"] == 3 * len(subdivide(sphere(levels=2)).faces)
 
 

@@ -110,7 +110,8 @@ def _write_solution(folder: Path) -> None:
             {"light": "cubemap", "resolution": 8, "step": 0, "fitted": 0.05, "held_out": 0.06},
             {"light": "cubemap", "resolution": 16, "step": 0, "fitted": 0.021, "held_out": 0.023},
         ],
-        "albedo_scale": {"factor": [1.0, 1.0, 1.0]}, "held_out_frames": [8], "warnings": [], "render_frames": RENDERED,
+        "albedo_scale": {"factor": [1.0, 1.0, 1.0]}, "held_out_frames": [5, 8], "warnings": [],
+        "render_frames": RENDERED,
     }
     write_json(folder / "solve.json", solve)
 

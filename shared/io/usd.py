@@ -198,7 +198,7 @@ def _define_capture(stage: Usd.Stage, root: Usd.Prim, asset: HeadAsset) -> None:
     UsdGeom.Scope.Define(stage, scope)
     camera = define_camera(stage, str(scope.AppendChild("camera")), capture)
     camera.GetPrim().SetCustomDataByKey("limn", _camera_metadata(capture))
-    define_dome_light(stage, str(scope.AppendChild("light")), asset.envmap)
+    define_dome_light(stage, str(scope.AppendChild("light")), asset.envmap, capture)
     if asset.plate is not None:
         define_plate(stage, str(scope.AppendChild("plate")), capture, asset.plate)
     if capture.moves == "head":

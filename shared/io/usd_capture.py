@@ -30,7 +30,7 @@ class Capture:
     height frame.
 
     moves: "head" or "camera", what turned while the light stood still. film_width_mm: width of the sensor
-    that the full frame shows.
+    that the full frame shows. light_with_camera: the camera moved and carried the light along.
     """
 
     camera_from_head: np.ndarray
@@ -41,6 +41,7 @@ class Capture:
     height: int
     moves: str
     film_width_mm: float = DEFAULT_FILM_WIDTH_MM
+    light_with_camera: bool = False
 
 
 @dataclass(frozen=True)
@@ -118,13 +119,15 @@ def animate(prim: UsdGeom.Xformable, world_from_local: np.ndarray, time_codes: n
         last = rotation
 
 
-def define_dome_light(stage: Usd.Stage, path: str, envmap: Texture) -> UsdLux.DomeLight:
-    """The recovered light: a dome with the lat-long map, intensity 1, at rest."""
+def define_dome_light(stage: Usd.Stage, path: str, envmap: Texture, capture: Capture) -> UsdLux.DomeLight:
+    """The recovered light: a dome with the lat-long map, intensity 1, at rest unless the camera carried it."""
     light = UsdLux.DomeLight.Define(stage, path)
     light.CreateIntensityAttr(1.0)
     light.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
     texture = light.CreateTextureFileAttr(Sdf.AssetPath(envmap.path))
     texture.SetColorSpace(envmap.colour_space)
+    if capture.light_with_camera:
+        animate(light, world_from_usd_camera(capture), capture.frame_index)
     return light
 
 

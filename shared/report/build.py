@@ -45,7 +45,8 @@ def result_report(result: Result, frame_count: int) -> str:
     frames, poses, solve, record = result.frames, result.poses, result.solve, result.record
     tracked, solved = result.folders["track_landmarks"], result.folders["inverse_render"]
     held_out = solve.get("held_out_frames", [])
-    chosen = chosen_frames(solve["render_frames"], held_out, frame_count)
+    again = result.views.held_out if result.views else {}
+    chosen = chosen_frames([*solve["render_frames"], *again], held_out, frame_count)
     angles, position = motion(poses["camera_from_head"], frames.moves)
     overlay = tracked / "overlay.png"
     excluded = excluded_frames(result.folders["sample_frames"], tracked)
@@ -53,7 +54,7 @@ def result_report(result: Result, frame_count: int) -> str:
         name=result.name,
         facts=_facts(frames),
         numbers=_numbers(angles, len(excluded), record),
-        frames=compared_frames(frames, solved / "renders", chosen, held_out),
+        frames=compared_frames(frames, solved / "renders", chosen, held_out, again),
         maps={name: result.maps[name] for name in SOLVED_MAPS},
         envmap=result.envmap,
         views=result.views,

@@ -77,16 +77,25 @@ def chosen_frames(available: Sequence[int], held_out: Sequence[int], count: int)
     return sorted(picked)
 
 
-def compared_frames(frames: FrameSet, renders: Path, chosen: Sequence[int], held_out: Sequence[int]) -> Iterator[Frame]:
-    """The chosen frames of the clip with their re-renders, one at a time."""
+def compared_frames(
+    frames: FrameSet,
+    renders: Path,
+    chosen: Sequence[int],
+    held_out: Sequence[int],
+    again: Mapping[int, np.ndarray] | None = None,
+) -> Iterator[Frame]:
+    """The chosen frames of the clip with their re-renders, one at a time: those in again {frame: [H, W, 3]}, else from
+    the folder renders."""
+    known = again or {}
     for frame_index in chosen:
         position = frames.position(frame_index)
         codes = frames.read_codes(position)
+        found = known[frame_index] if frame_index in known else read_exr(renders / f"{frame_index:06d}.exr")
         yield Frame(
             frame_index=frame_index,
             time_s=float(frames.time_s[position]),
             clip=frames.read_linear(position),
-            render=read_exr(renders / f"{frame_index:06d}.exr"),
+            render=found,
             clipped=(codes >= np.iinfo(codes.dtype).max - (1 if codes.dtype == np.uint8 else 256)).any(-1),
             held_out=frame_index in set(held_out),
         )

@@ -33,28 +33,6 @@ ORIENTATION_MM = 40.0
 RELIT_YAW_DEG = -15.0
 
 
-def make_views(
-    mesh: Mesh,
-    maps: Mapping[str, np.ndarray],
-    envmap: np.ndarray,
-    camera_from_head: np.ndarray,
-    moves: str,
-    pixels: int,
-    progress: Callable | None = None,
-) -> ViewSet:
-    """All of them, pixels wide. maps and progress as for HeadViews; envmap [H, 2 H, 3], camera_from_head [F, 4, 4] and
-    moves of the clip."""
-    views = HeadViews(mesh, maps, VIEW_SIZES, progress)
-    light = clip_light(envmap, camera_from_head, moves)
-    novel = views.render(light, [orbit_camera(mesh, *place, pixels) for place in NOVEL_VIEWS.values()])
-    camera, front = orbit_camera(mesh, RELIT_YAW_DEG, 0.0, pixels), orbit_camera(mesh, 0.0, 0.0, pixels)
-    return ViewSet(
-        dict(zip(NOVEL_VIEWS, novel, strict=True)),
-        {name: views.render(studio_light(name), [camera])[0] for name in STUDIO_LIGHTS},
-        {roughness: views.visibility(front, roughness) for roughness in ROUGHNESSES},
-    )
-
-
 @dataclass(frozen=True)
 class Camera:
     """camera_from_head [4, 4] mm, intrinsics [3, 3] px of a picture of size (width, height)."""
@@ -62,6 +40,31 @@ class Camera:
     camera_from_head: np.ndarray
     intrinsics: np.ndarray
     size: tuple[int, int]
+
+
+def make_views(
+    mesh: Mesh,
+    maps: Mapping[str, np.ndarray],
+    envmap: np.ndarray,
+    camera_from_head: np.ndarray,
+    moves: str,
+    pixels: int,
+    held_out: Mapping[int, Camera],
+    progress: Callable | None = None,
+) -> ViewSet:
+    """All of them, pixels wide. maps and progress as for HeadViews; envmap [H, 2 H, 3], camera_from_head [F, 4, 4] and
+    moves of the clip; held_out: frames of the clip to re-render, with their cameras."""
+    views = HeadViews(mesh, maps, VIEW_SIZES, progress)
+    light = clip_light(envmap, camera_from_head, moves)
+    novel = views.render(light, [orbit_camera(mesh, *place, pixels) for place in NOVEL_VIEWS.values()])
+    again = views.render(envmap, list(held_out.values()), moves, fade=False) if held_out else []
+    camera, front = orbit_camera(mesh, RELIT_YAW_DEG, 0.0, pixels), orbit_camera(mesh, 0.0, 0.0, pixels)
+    return ViewSet(
+        dict(zip(NOVEL_VIEWS, novel, strict=True)),
+        {name: views.render(studio_light(name), [camera])[0] for name in STUDIO_LIGHTS},
+        {roughness: views.visibility(front, roughness) for roughness in ROUGHNESSES},
+        dict(zip(held_out, again, strict=True)),
+    )
 
 
 def orbit_camera(mesh: Mesh, yaw_deg: float, pitch_deg: float, pixels: int) -> Camera:
@@ -118,8 +121,14 @@ class HeadViews:
         gloss = float(np.median(sample_bilinear(maps["specular_intensity"], uv)))
         return Material(albedo, gloss, float(np.median(sample_bilinear(maps["roughness"], uv))))
 
-    def render(self, light: np.ndarray, cameras: Sequence[Camera]) -> list[np.ndarray]:
-        """Lat-long radiance in head space [H, 2 H, 3] -> a linear picture [h, w, 3] per camera, 0 beside the head."""
+    def render(
+        self, light: np.ndarray, cameras: Sequence[Camera], moves: str = "camera", fade: bool = True
+    ) -> list[np.ndarray]:
+        """Lat-long radiance [H, 2 H, 3] -> a linear picture [h, w, 3] per camera, 0 beside the head.
+
+        moves "camera": the light is given in head space; "head": in the world of geometry.world_from_head. fade: pixels
+        that the head covers in part are darker by the rest; else they show the mean of the part.
+        """
         poses = np.stack([camera.camera_from_head for camera in cameras])
         shading = VertexShading(
             np.arange(len(self.points)),
@@ -131,7 +140,7 @@ class HeadViews:
             np.maximum(cube_from_latlong(light, LIGHT_RESOLUTION), 0.0),
             self.scenery.directions,
             poses,
-            "camera",
+            moves,
             key_step=0.0,
         )
         pictures = []
@@ -139,7 +148,7 @@ class HeadViews:
             picture, covered = render_frame(
                 self.viewer, shading, self.maps, k, camera.camera_from_head, camera.intrinsics, camera.size
             )
-            pictures.append(picture * covered[..., None])
+            pictures.append(picture * covered[..., None] if fade else picture)
         return pictures
 
     def visibility(self, camera: Camera, roughness: float) -> np.ndarray:
