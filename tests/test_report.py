@@ -186,7 +186,7 @@ def test_print_leaves_out_what_paper_cannot_do(opened):
     opened.emulate("print")
     hidden = "getComputedStyle(document.querySelector('%s')).display === 'none'"
     try:
-        assert all(opened.evaluate(hidden % name) for name in ("nav", "#view", ".slider input"))
+        assert all(opened.evaluate(hidden % name) for name in ("nav", "#view", ".slider input", ".on-screen"))
         assert not any(opened.evaluate(hidden % name) for name in ("#frames", "#maps", "#novel", "#warnings"))
     finally:
         opened.emulate("screen")

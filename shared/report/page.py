@@ -23,7 +23,7 @@ _VIEWER = """<canvas id="viewer" aria-label="the head in 3D"></canvas>
 <label><input id="viewer-moves-head" name="viewer-moves" type="radio" checked> drag turns the head</label>
 <label><input id="viewer-moves-lamp" name="viewer-moves" type="radio"> drag moves the lamp</label>
 <label>light of the clip <input id="viewer-clip" type="range" min="0" max="2" step="0.01" value="1"></label>
-<label>lamp <input id="viewer-lamp" type="range" min="0" max="4" step="0.01" value="0.8"></label>
+<label>lamp <input id="viewer-lamp" type="range" min="0" max="4" step="0.01" value="0.4"></label>
 <label><input id="viewer-plain" type="checkbox"> shape only</label>
 </div>
 <p class="note">A quick look: mesh reduced, light of the clip as soft harmonics, no shadows.</p>"""

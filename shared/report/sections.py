@@ -109,7 +109,7 @@ def map_section(maps: Mapping[str, np.ndarray]) -> str:
         height, width = np.asarray(values).shape[:2]
         caption = f"<b>{escape(title)}</b>, {width} x {height}: {escape(text.format(high=high))}"
         parts.append(figure(jpeg_uri(picture), title, caption, zoom=True))
-    return f'<div class="maps">{"".join(parts)}</div>{_DIALOG}<p class="note">Click a map to enlarge it.</p>'
+    return f'<div class="maps">{"".join(parts)}</div>{_DIALOG}<p class="note on-screen">Click a map to enlarge it.</p>'
 
 
 def map_picture(name: str, values: np.ndarray) -> tuple[np.ndarray, float]:

@@ -26,8 +26,8 @@ from shared.texture import sample_bilinear
 from shared.transfer import Transfer, mesh_points
 from shared.view_set import NOVEL_VIEWS, ROUGHNESSES, ViewSet
 
-DISTANCE_MM, FILLED = 900.0, 0.86
-"""The virtual camera's distance from the head's middle, and the share of the picture that the head fills."""
+DISTANCE_MM, FILLED = 900.0, 1.1
+"""The virtual camera's distance from the head's middle, and the head's half diagonal in half pictures."""
 LIGHT_RESOLUTION, VIEW_SIZES = 16, Sizes(directions=640, nodes=500)
 ORIENTATION_MM = 40.0
 RELIT_YAW_DEG = -15.0
