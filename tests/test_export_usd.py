@@ -148,6 +148,7 @@ def test_plate_fills_the_crop_in_the_cameras_view(exported, moves):
     x0, y0, scale = CROP
     edges = [[x0, y0 + CROP_SIZE[1] / scale], [x0 + CROP_SIZE[0] / scale, y0]]
     picture = UsdShade.Shader(root.GetPrimAtPath("capture/plate/material/picture"))
+    assert picture.GetInput("file").Get().path == f"./plates/{FRAMES[0]:04d}.jpg"
     for frame in FRAMES:
         frustum = UsdGeom.Camera(camera).GetCamera(float(frame)).frustum
         world = UsdGeom.Imageable(card).ComputeLocalToWorldTransform(float(frame))

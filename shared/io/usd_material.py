@@ -97,9 +97,11 @@ def define_plate_material(stage: Usd.Stage, path: str, files: Mapping[int, str])
     texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
     file = texture.CreateInput("file", Sdf.ValueTypeNames.Asset)
     file.GetAttr().SetColorSpace(SRGB)
+    file.Set(Sdf.AssetPath(next(iter(files.values()))))  # for readers that know no animated pictures
     for time, picture in files.items():
         file.Set(Sdf.AssetPath(picture), float(time))
-    texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
+    for name, value in (("sourceColorSpace", "sRGB"), ("wrapS", "clamp"), ("wrapT", "clamp")):
+        texture.CreateInput(name, Sdf.ValueTypeNames.Token).Set(value)
     output = texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
     surface.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(output)
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
