@@ -84,17 +84,17 @@ def write_head_usda(folder: Path | str, asset: HeadAsset) -> None:
     layers = {GEOMETRY: _layer(_define_geometry, root, asset), MATERIALS: _layer(_define_materials, root, asset)}
     # While the interface is authored the heavy layers lie below it, so that types resolve; then they become a payload.
     layers[INTERFACE] = _layer(_define_interface, root, asset, [layers[MATERIALS], layers[GEOMETRY]])
-    layers[PAYLOAD] = _layer(_define_nothing, root, asset)
+    layers[PAYLOAD] = _layer(lambda *_: None, root, asset)
     layers[PAYLOAD].subLayerPaths = [f"./{MATERIALS}", f"./{GEOMETRY}"]
     prim = layers[INTERFACE].GetPrimAtPath(root)
     prim.specifier, prim.typeName = Sdf.SpecifierDef, "Xform"
     prim.payloadList.Prepend(Sdf.Payload(f"./{PAYLOAD}"))
     prim.assetInfo["identifier"] = Sdf.AssetPath(f"./{INTERFACE}")
     prim.assetInfo["payloadAssetDependencies"] = Sdf.AssetPathArray([Sdf.AssetPath(f"./{PAYLOAD}")])
-    kind = Sdf.CreatePrimInLayer(layers[INTERFACE], f"/__class__/{root.name}")
-    for spec in (kind, kind.nameParent):
+    base = Sdf.CreatePrimInLayer(layers[INTERFACE], f"/__class__/{root.name}")
+    for spec in (base, base.nameParent):
         spec.specifier = Sdf.SpecifierClass
-    prim.inheritPathList.Prepend(kind.path)
+    prim.inheritPathList.Prepend(base.path)
     for name, layer in layers.items():
         if not layer.Export(str(folder / name)):
             raise LimnError(f"{folder / name}: USD could not write the layer")
@@ -111,10 +111,6 @@ def _layer(define: Callable, root: Sdf.Path, asset: HeadAsset, below: Sequence[S
     del stage
     layer.subLayerPaths.clear()
     return layer
-
-
-def _define_nothing(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None:
-    """The payload's own opinions: none."""
 
 
 def write_single_layer(path: Path | str, asset: HeadAsset) -> None:

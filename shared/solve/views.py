@@ -87,9 +87,9 @@ def frontal_frame(camera_from_head: np.ndarray) -> int:
     return int(np.argmax((camera_from_head[:, :3, 2] * towards).sum(1)))
 
 
-def light_in_head_space(envmap: np.ndarray, world_from_head_: np.ndarray) -> np.ndarray:
-    """Lat-long radiance in the world [H, 2 H, 3], rotation [3, 3] -> the same light as the head sees it."""
-    return latlong_lookup(envmap, latlong_directions(len(envmap)) @ world_from_head_.T)
+def light_in_head_space(envmap: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Lat-long radiance in the world [H, 2 H, 3], turn [3, 3] world_from_head -> the same light as the head sees it."""
+    return latlong_lookup(envmap, latlong_directions(len(envmap)) @ turn.T)
 
 
 class HeadViews:
