@@ -117,7 +117,7 @@ def describe_asset(job: Job, mesh, capture, frames, writer):
 
     plate = None
     if job.params.plates:
-        shown = write_plates(job.out / "plates", frames, capture.frame_index, lambda all: job.progress(all, "plates"))
+        shown = write_plates(job.out / "plates", frames, capture.frame_index, job.progress)
         plate = Plate({frame: f"./plates/{name}" for frame, name in shown.items()}, crop_rectangle(frames))
     spaces = {"diffuse_albedo": writer.colour_space}
     maps = {name: Texture(f"./maps/{writer.file_name(name)}", spaces.get(name, "data")) for name in SHADER_INPUTS}
@@ -165,7 +165,8 @@ def held_out_cameras(poses: dict, frames, solve: dict) -> dict:
     done = set(solve["render_frames"])
     rest = [frame for frame in solve.get("held_out_frames", ()) if frame in place and frame not in done]
     chosen = [rest[i] for i in spread_frames(len(rest), HELD_OUT_SHOWN)] if rest else []
-    return {frame: Camera(poses["camera_from_head"][place[frame]], frames.intrinsics, frames.size) for frame in chosen}
+    lens = poses.get("intrinsics_crop", frames.intrinsics)
+    return {frame: Camera(poses["camera_from_head"][place[frame]], lens, frames.size) for frame in chosen}
 
 
 def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, frames, solve: dict):

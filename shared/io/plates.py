@@ -23,14 +23,17 @@ def srgb_codes(frames: FrameSet) -> np.ndarray:
 
 
 def write_plates(
-    folder: Path, frames: FrameSet, frame_index: np.ndarray, progress: Callable[[Iterable], Iterable] = iter
+    folder: Path, frames: FrameSet, frame_index: np.ndarray, progress: Callable[[Iterable, str], Iterable]
 ) -> dict[int, str]:
-    """Writes the crops of frame_index [F] as folder/%04d.jpg, no side beyond LONGEST_SIDE. -> {frame: file name}."""
+    """Writes the crops of frame_index [F] as folder/%04d.jpg, no side beyond LONGEST_SIDE. -> {frame: file name}.
+
+    progress(items, label) wraps the loop.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     table, written = srgb_codes(frames), {}
     scale = min(1.0, LONGEST_SIDE / max(frames.size))
     size = tuple(max(1, round(side * scale)) for side in frames.size)
-    for frame in progress(frame_index):
+    for frame in progress(frame_index, "plates"):
         picture = table[frames.read_codes(frames.position(int(frame)))]
         if scale < 1.0:
             picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)

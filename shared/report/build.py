@@ -52,7 +52,7 @@ def result_report(result: Result, frame_count: int) -> str:
     excluded = excluded_frames(result.folders["sample_frames"], tracked)
     content = ReportContent(
         name=result.name,
-        facts=_facts(frames),
+        facts=_facts(frames, float(poses["intrinsics"][0, 0])),
         numbers=_numbers(angles, len(excluded), record),
         frames=compared_frames(frames, solved / "renders", chosen, held_out, again),
         maps={name: result.maps[name] for name in SOLVED_MAPS},
@@ -76,7 +76,7 @@ def result_report(result: Result, frame_count: int) -> str:
     return report_html(content)
 
 
-def _facts(frames: FrameSet) -> list[tuple[str, str]]:
+def _facts(frames: FrameSet, focal_px: float) -> list[tuple[str, str]]:
     width, height = frames.source_size
     lens = "given" if frames.focal_known else "estimated"
     mover = {"head": "the head turns", "camera": "the camera moves"}[frames.moves]
@@ -85,7 +85,7 @@ def _facts(frames: FrameSet) -> list[tuple[str, str]]:
         ("size", f"{width} x {height}"),
         ("at", f"{frames.fps:.4g} frames/s"),
         (mover + ",", f"colour {frames.transfer}"),
-        ("focal length", f"{frames.intrinsics_source[0, 0]:.0f} px ({lens})"),
+        ("focal length", f"{focal_px:.0f} px ({lens})"),
     ]
 
 
