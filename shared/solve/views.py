@@ -19,7 +19,7 @@ from shared.mesh import Mesh, interpolate, normalised
 from shared.raycast import RayScene, camera_hits
 from shared.render import SurfaceMaps, render_frame
 from shared.shading import Material, VertexShading
-from shared.solve.capture import Sizes, set_scenery
+from shared.solve.capture import Sizes, face_front, set_scenery
 from shared.split_sum import SplitSum
 from shared.studio_lights import STUDIO_LIGHTS, studio_light
 from shared.texture import sample_bilinear
@@ -54,11 +54,11 @@ def make_views(
 ) -> ViewSet:
     """All of them, pixels wide. maps and progress as for HeadViews; envmap [H, 2 H, 3], camera_from_head [F, 4, 4] and
     moves of the clip; held_out: frames of the clip to re-render, with their cameras."""
-    views = HeadViews(mesh, maps, VIEW_SIZES, progress)
-    light = clip_light(envmap, camera_from_head, moves)
-    novel = views.render(light, [orbit_camera(mesh, *place, pixels) for place in NOVEL_VIEWS.values()])
-    again = views.render(envmap, list(held_out.values()), moves, fade=False) if held_out else []
+    around = [orbit_camera(mesh, *place, pixels) for place in NOVEL_VIEWS.values()]
     camera, front = orbit_camera(mesh, RELIT_YAW_DEG, 0.0, pixels), orbit_camera(mesh, 0.0, 0.0, pixels)
+    views = HeadViews(mesh, maps, VIEW_SIZES, [*around, camera, front, *held_out.values()], progress)
+    novel = views.render(clip_light(envmap, camera_from_head, moves), around)
+    again = views.render(envmap, list(held_out.values()), moves, fade=False) if held_out else []
     return ViewSet(
         dict(zip(NOVEL_VIEWS, novel, strict=True)),
         {name: views.render(studio_light(name), [camera])[0] for name in STUDIO_LIGHTS},
@@ -95,22 +95,31 @@ def light_in_head_space(envmap: np.ndarray, turn: np.ndarray) -> np.ndarray:
 class HeadViews:
     """Pictures of one solved head.
 
-    maps: diffuse_albedo [S, S, 3], specular_intensity [S, S], roughness [S, S]. progress(items, label) wraps the trace.
+    maps: diffuse_albedo [S, S, 3], specular_intensity [S, S], roughness [S, S]. cameras: all that will look at it, so
+    that only what they can see is traced; none: everything. progress(items, label) wraps the trace.
     """
 
     def __init__(
-        self, mesh: Mesh, maps: Mapping[str, np.ndarray], sizes: Sizes | None = None, progress: Callable | None = None
+        self,
+        mesh: Mesh,
+        maps: Mapping[str, np.ndarray],
+        sizes: Sizes | None = None,
+        cameras: Sequence[Camera] = (),
+        progress: Callable | None = None,
     ):
         self.viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
         self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"])
         self.scenery = set_scenery(self.viewer, sizes or Sizes())
-        self.points = mesh_points(mesh)
+        poses = [camera.camera_from_head for camera in cameras]
+        seen = face_front(self.viewer, np.stack(poses), -0.1) if poses else np.ones(len(mesh.vertices), bool)
+        self.index = np.nonzero(seen)[0]
+        self.points = mesh_points(mesh, self.index)
         wrap = progress or (lambda items, label: items)
         self.transfer: Transfer = self.scenery.trace(self.points, lambda items: wrap(items, "visibility"))
         self.material = self._bounce_material(mesh, maps)
         # What stands in for a point deep in a cavity is the nearest one in the open. Seen from inside the mouth that
         # can be the outside of the cheek, unless orientation counts as well.
-        self._surface_place = np.concatenate([mesh.vertices, ORIENTATION_MM * self.points.normals], axis=1)
+        self._surface_place = np.concatenate([mesh.vertices, ORIENTATION_MM * self.viewer.normals], axis=1)
 
     def _bounce_material(self, mesh: Mesh, maps: Mapping[str, np.ndarray]) -> Material:
         """What light that bounces meets: the maps at the nodes."""
@@ -131,7 +140,7 @@ class HeadViews:
         """
         poses = np.stack([camera.camera_from_head for camera in cameras])
         shading = VertexShading(
-            np.arange(len(self.points)),
+            self.index,
             self._surface_place,
             self.points,
             self.transfer,
@@ -154,13 +163,13 @@ class HeadViews:
     def visibility(self, camera: Camera, roughness: float) -> np.ndarray:
         """[h, w]: share of a lobe of this roughness about the reflected direction that the head leaves open; NaN beside
         the head. 1 where nothing covers it; for rough lobes it nears the sky's open share."""
-        vertices, normals = self.viewer.mesh.vertices, self.points.normals
+        normals = self.points.normals
         centre = -camera.camera_from_head[:3, 3] @ camera.camera_from_head[:3, :3]
-        towards = normalised(centre - vertices)
+        towards = normalised(centre - self.points.positions)
         facing = np.nonzero((towards * normals).sum(1) > 0.0)[0]
-        share = np.ones(len(vertices))
+        share = np.ones(len(self.viewer.mesh.vertices))
         visible = self.transfer.visibility(facing)
-        share[facing] = SplitSum(self.scenery.directions).visible_share(
+        share[self.index[facing]] = SplitSum(self.scenery.directions).visible_share(
             normals[facing], towards[facing], roughness, visible
         )
         face, bary, _ = camera_hits(self.viewer.scene, camera.camera_from_head, camera.intrinsics, *camera.size)
