@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+import reprlib
+
+_LONGEST_PART = 400
+_brief = reprlib.Repr()
+_brief.maxstring = _brief.maxother = _brief.maxlong = 80
+_brief.maxlevel = 2
+
 
 class LimnError(Exception):
     """A failure of Limn's own (exit code 1)."""
@@ -18,14 +25,14 @@ class InputError(LimnError):
         super().__init__(self._line())
 
     def _line(self) -> str:
-        parts = [f"{self.where}: {self.what}" if self.where else self.what]
+        parts = [f"{_plain(self.where, 5000)}: {self.what}" if self.where else self.what]
         if self.got != "":
-            parts.append(f"got {self.got}")
+            parts.append(f"got {_plain(self.got)}")
         if self.expected != "":
-            parts.append(f"expected {self.expected}")
+            parts.append(f"expected {_plain(self.expected)}")
         if self.mend:
             parts.append(self.mend)
-        return " ".join("; ".join(parts).split())
+        return _plain(" ".join("; ".join(parts).split()), 10_000)
 
     def __reduce__(self):
         fields = {"where": self.where, "got": self.got, "expected": self.expected, "mend": self.mend}
@@ -34,3 +41,21 @@ class InputError(LimnError):
 
 def _rebuild_input_error(what: str, fields: dict) -> InputError:
     return InputError(what, **fields)
+
+
+def shown(value: object) -> str:
+    """`value` as Python writes it, cut short: what stands in a hostile file must not fill the line, or hours."""
+    try:
+        return _brief.repr(value)
+    except ValueError:  # an integer of thousands of digits
+        return f"{type(value).__name__} of very many digits"
+
+
+def _plain(value: object, longest: int = _LONGEST_PART) -> str:
+    """Text without control characters, which a terminal would obey, and no longer than that."""
+    try:
+        text = str(value)
+    except ValueError:
+        text = shown(value)
+    text = text if len(text) <= longest else text[:longest] + " ..."
+    return "".join(c if c.isprintable() or c.isspace() else ascii(c)[1:-1] for c in text)

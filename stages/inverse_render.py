@@ -56,8 +56,10 @@ STAGE = Stage(
         Parameter("light_smoothness", float, 1.0, "Weight of the light's smoothness.", "", 0.0, 1000.0),
         Parameter("evidence", float, 5000.0, "How many independent samples the clip counts as.", "", 10.0, 1e7),
         Parameter("render_count", int, 8, "Frames to re-render, spread evenly.", "frames", 1, 2000),
-        Parameter("mesh", str, "", "Mesh (.npz or .obj) to use instead of the tracked one; empty: tracked."),
-        Parameter("poses", str, "", "Poses (.npz: camera_from_head, perhaps frame_index) to use; empty: tracked."),
+        Parameter("mesh", str, "", "Mesh (.npz or .obj) to use instead of the tracked one; empty: tracked.",
+                  file=True),
+        Parameter("poses", str, "", "Poses (.npz: camera_from_head, perhaps frame_index) to use; empty: tracked.",
+                  file=True),
     ),
 )
 

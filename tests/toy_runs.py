@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from shared.contract.confine import trust
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 TOY = Path(__file__).with_name("toy_pipeline")
 TEXT = "A rose is a rose\nis a rose\n"
@@ -14,6 +16,7 @@ CURRENT_STAGES = ("read_text", "count_words", "draw_bars", "export_page")
 
 def copy_pipeline(folder):
     """The toy pipeline in a folder of its own, so that a test may change its code. Returns pipeline.yaml."""
+    trust([folder])
     shutil.copytree(TOY, folder, ignore=shutil.ignore_patterns("__pycache__"))
     return folder / "pipeline.yaml"
 

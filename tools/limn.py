@@ -20,6 +20,7 @@ import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 
+from shared.contract.confine import trust
 from shared.contract.declare import parameter_table
 from shared.contract.pipeline import load_pipeline, split_settings
 from shared.contract.subject import MOVES, TRANSFERS
@@ -39,6 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code."""
     try:
         args = make_parser().parse_args(argv)
+        trust(getattr(args, "trust", []))
         return args.command(args)
     except InputErrors as errors:
         for error in errors.errors:
@@ -89,6 +91,8 @@ def _subject_command(commands: argparse._SubParsersAction, name: str, command, t
     parser.add_argument("subjects", nargs="+", type=Path, metavar="SUBJECT", help="folder with subject.yaml")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write to DIR/<subject>/, not to the subject's folder")
     parser.add_argument("--pipeline", type=Path, metavar="FILE", help="another pipeline.yaml")
+    parser.add_argument("--trust", type=Path, action="append", default=[], metavar="DIR",
+                        help="follow symbolic links into DIR, run stages that lie in it")
     parser.set_defaults(command=command)
     return parser
 
@@ -119,7 +123,9 @@ def run_command(args: argparse.Namespace) -> int:
         raise InputError("number of cores not allowed", where="--cores", got=cores, expected=">= 1")
     given = split_settings(args.set, pipeline.stages)
     preset = [f"--preset={args.preset}"] if args.preset else []
-    arguments = {name: preset + [f"--set={key}={value}" for key, value in given.get(name, {}).items()]
+    files = {(name, p.name) for name, stage in pipeline.stages.items() for p in stage.parameters if p.file}
+    arguments = {name: preset + [f"--set={key}={parameters[name][key] if (name, key) in files else value}"
+                                 for key, value in given.get(name, {}).items()]
                  for name in pipeline.stages}
     return run_cases(cases, Settings(pipeline, parameters, arguments, args.out, cores, args.profile))
 
@@ -163,7 +169,8 @@ def new_command(args: argparse.Namespace) -> int:
         args.clip, args.name, args.dest, args.link, args.focal_length_mm, args.sensor_width_mm, args.focal_length_px,
         args.transfer, args.moves))
     print(f"{folder}: {facts}")
-    print(f"look through {folder / 'subject.yaml'}, then: limn run {folder}")
+    vouch = f" --trust {os.path.realpath(args.clip.parent)}" if args.link else ""
+    print(f"look through {folder / 'subject.yaml'}, then: limn run {folder}{vouch}")
     return 0
 
 

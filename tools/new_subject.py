@@ -8,6 +8,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from shared.contract.confine import trust
 from shared.contract.subject import is_sequence, load_subject
 from shared.errors import InputError
 
@@ -46,6 +47,8 @@ def make_subject(new: NewSubject) -> tuple[Path, str]:
     """Makes the folder; returns it and a sentence about the clip. InputError leaves nothing behind."""
     from shared.io.video import probe
 
+    if new.link:
+        trust([Path(os.path.realpath(new.clip.parent))])
     info = probe(new.clip)
     name = new.name or (new.clip.parent.name if is_sequence(new.clip.name) else new.clip.stem)
     name = re.sub(r"[^\w.-]+", "_", name).strip("._") or "subject"

@@ -6,6 +6,7 @@ codec would; landmarks go in as a file of another tracker.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -112,11 +113,12 @@ def spoil_focal(subject: Path, destination: Path, gain: float) -> None:
 
 
 def _describe(subject: Path, destination: Path, changes: dict, chosen: np.ndarray | None) -> None:
-    """subject.yaml with changes, links to the clip and the truth; chosen: frames of the original that are left."""
+    """subject.yaml with changes, the clip, links to the truth; chosen: frames of the original that are left."""
     content = yaml.safe_load((subject / "subject.yaml").read_text(encoding="utf-8"))
     if chosen is None:
         head = Path(content["video"]).parts[0]
-        (destination / head).symlink_to((subject / head).resolve())
+        take = shutil.copytree if (subject / head).is_dir() else shutil.copyfile
+        take(subject / head, destination / head)
         (destination / "gt").symlink_to((subject / "gt").resolve())
     elif (subject / "gt").exists():
         (destination / "gt").mkdir()

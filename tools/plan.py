@@ -10,6 +10,7 @@ from shared.contract.hashing import HashMemory
 from shared.contract.manifest import (
     PROVENANCE,
     damage,
+    file_inputs,
     make_work,
     outputs_digest,
     read_manifest,
@@ -52,7 +53,8 @@ def _plan_stage(stage: Stage, case: Case, parameters: Mapping[str, object], plan
     if manifest is None:
         reason = "its manifest is missing or damaged" if folder.is_dir() else "never ran"
         return StagePlan(stage.name, RUNS, (reason,))
-    inputs = source_inputs(stage, case.subject, memory) | {name: plans[name].digest for name in stage.inputs}
+    inputs = source_inputs(stage, case.subject, memory) | file_inputs(stage, parameters, memory)
+    inputs |= {name: plans[name].digest for name in stage.inputs}
     reasons = make_work(stage, parameters, inputs).reasons(manifest) or damage(folder, manifest, memory)
     if reasons:
         return StagePlan(stage.name, RUNS, tuple(reasons))

@@ -7,14 +7,23 @@ from collections.abc import Mapping
 from shared.contract.declare import Stage
 from shared.contract.folders import RunFolder
 from shared.contract.hashing import HashMemory
-from shared.contract.manifest import Work, damage, make_work, outputs_digest, read_manifest, source_inputs
+from shared.contract.manifest import (
+    Work,
+    damage,
+    file_inputs,
+    make_work,
+    outputs_digest,
+    read_manifest,
+    source_inputs,
+)
 from shared.contract.subject import Subject
 from shared.errors import InputError
 
 
-def input_hashes(stage: Stage, subject: Subject, run: RunFolder, memory: HashMemory) -> dict[str, str]:
+def input_hashes(stage: Stage, subject: Subject, run: RunFolder, parameters: Mapping[str, object],
+                 memory: HashMemory) -> dict[str, str]:
     """{name: SHA-256} of all that the stage reads; InputError where an input stage has no sound result."""
-    inputs = source_inputs(stage, subject, memory)
+    inputs = source_inputs(stage, subject, memory) | file_inputs(stage, parameters, memory)
     for name in stage.inputs:
         folder = run.published(name)
         manifest = read_manifest(folder)
@@ -28,7 +37,7 @@ def input_hashes(stage: Stage, subject: Subject, run: RunFolder, memory: HashMem
 def work_to_do(stage: Stage, subject: Subject, run: RunFolder, parameters: Mapping[str, object],
                memory: HashMemory) -> Work:
     """The stage's work on the inputs as they lie on disk."""
-    return make_work(stage, parameters, input_hashes(stage, subject, run, memory))
+    return make_work(stage, parameters, input_hashes(stage, subject, run, parameters, memory))
 
 
 def reasons_to_run(work: Work, run: RunFolder, memory: HashMemory) -> list[str]:

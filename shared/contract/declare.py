@@ -6,6 +6,7 @@ One declaration gives the command line, the validation, the cache key, the manif
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from fnmatch import fnmatchcase
 from pathlib import PurePosixPath
 
 from shared.contract.wording import unknown_name
-from shared.errors import InputError
+from shared.errors import InputError, shown
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
 _COUNTER = re.compile(r"%(?:0?\d+)?d")
@@ -26,7 +27,8 @@ class Parameter:
     """One setting of a stage. A default of None means 'not set' and lets users give none.
 
     type: int, float, bool or str. help: one sentence. unit: '' for counts, ratios and names. minimum, maximum:
-    inclusive. choices: all allowed values.
+    inclusive. choices: all allowed values. file: the text names a file; only a command line may do that, never
+    pipeline.yaml, and the file's content counts as an input. Its path becomes absolute.
     """
 
     name: str
@@ -37,6 +39,7 @@ class Parameter:
     minimum: float | None = None
     maximum: float | None = None
     choices: tuple = ()
+    file: bool = False
 
     def __post_init__(self) -> None:
         if not _NAME.match(self.name) or self.type not in _KIND or not self.help:
@@ -51,7 +54,7 @@ class Parameter:
             raise InputError("no value", where=where, expected=self.expected)
         typed = self._typed(value)
         if typed is None or not self._allowed(typed):
-            raise InputError("value not allowed", where=where, got=repr(value), expected=self.expected)
+            raise InputError("value not allowed", where=where, got=shown(value), expected=self.expected)
         return typed
 
     def _typed(self, value: object) -> object | None:
@@ -59,11 +62,11 @@ class Parameter:
         if self.type is bool:
             text = str(value).lower()
             return True if text in _TRUE else False if text in _FALSE else None
-        if self.type is str:
-            return str(value) if isinstance(value, str | int | float) and not isinstance(value, bool) else None
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             return None
         try:
+            if self.type is str:
+                return os.path.abspath(value) if self.file and value else str(value)
             number = float(value)
             if not math.isfinite(number) or (self.type is int and number != int(number)):
                 return None

@@ -68,7 +68,8 @@ def _do(request: Request, work: Work, run: Callable[[Job], None], check: Callabl
             check(job)
     finally:
         cost = meter.stop()
-    if input_hashes(stage, request.subject, folders, HashMemory(folders.memory)) != work.inputs:
+    after = input_hashes(stage, request.subject, folders, request.parameters, HashMemory(folders.memory))
+    if after != work.inputs:
         raise LimnError(f"{stage.name}: an input changed while the stage ran; run it again")
     entries = output_entries(stage, temporary)
     write_record(temporary / MANIFEST, {**work.content(), "key": work.key, "outputs": entries})

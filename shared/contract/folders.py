@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from shared.contract.confine import check_results
 from shared.contract.declare import folder_of
 from shared.contract.manifest import LOG, outputs_digest, read_manifest
 from shared.errors import InputError
@@ -25,8 +26,10 @@ class RunFolder:
 
     @classmethod
     def of(cls, folder: Path, name: str, out: Path | None) -> RunFolder:
-        """The subject's own folder, or out/<name of the subject>."""
-        return cls(Path(os.path.abspath(out)) / name if out else folder)
+        """The subject's own folder, or out/<name of the subject>; InputError for links in place of results."""
+        run = cls(Path(os.path.abspath(out)) / name if out else folder)
+        check_results(run.root, run.work)
+        return run
 
     def published(self, name: str) -> Path:
         """The stage's folder."""
@@ -120,7 +123,7 @@ def _acquire(path: Path, deadline: float) -> int:
     while True:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
         except FileNotFoundError:
             continue
         except OSError as error:

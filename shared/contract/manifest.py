@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from shared.contract.declare import Stage
 from shared.contract.hashing import HashMemory, hash_file, hash_value
 from shared.contract.shapes import describe
 from shared.contract.subject import Subject
-from shared.errors import LimnError
+from shared.errors import InputError, LimnError
 
 SCHEMA = 1
 MANIFEST, PROVENANCE, LOG = "manifest.json", "provenance.json", "log.txt"
@@ -90,6 +90,15 @@ def source_inputs(stage: Stage, subject: Subject, memory: HashMemory) -> dict[st
     return inputs
 
 
+def file_inputs(stage: Stage, parameters: Mapping[str, object], memory: HashMemory) -> dict[str, str]:
+    """{parameter: SHA-256} of files that parameters name."""
+    named = {p.name: Path(parameters[p.name]) for p in stage.parameters if p.file and parameters[p.name]}
+    for name, path in named.items():
+        if not path.is_file():
+            raise InputError("no such file", where=f"--set {stage.name}.{name}", got=str(path))
+    return {f"file {name}": memory.hash(path) for name, path in named.items()}
+
+
 def outputs_digest(manifest: Mapping[str, object]) -> str:
     """SHA-256 over the names and hashes of all outputs: what later stages depend on."""
     return hash_value({name: entry.get("sha256", "") for name, entry in manifest["outputs"].items()
@@ -123,16 +132,34 @@ def read_record(path: Path) -> dict | None:
     """A manifest or provenance; None where it is absent or not readable as one."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return record if isinstance(record, dict) else None
 
 
 def read_manifest(folder: Path) -> dict | None:
-    """The folder's manifest; None where it is absent or damaged."""
-    manifest = read_record(folder / MANIFEST)
-    needed = ("schema", "stage", "version", "parameters", "seed", "inputs", "outputs")
-    return manifest if manifest and all(name in manifest for name in needed) else None
+    """The folder's manifest; None where it is absent or damaged, or the folder is a link."""
+    manifest = None if folder.is_symlink() else read_record(folder / MANIFEST)
+    return manifest if manifest is not None and _is_manifest(manifest) else None
+
+
+def _is_manifest(record: Mapping[str, object]) -> bool:
+    """Whether the record has all that a manifest needs, each of its kind, and names files of its own folder only."""
+    kinds = {"schema": int, "stage": str, "version": int, "parameters": dict, "seed": int, "inputs": dict,
+             "outputs": dict}
+    if not all(isinstance(record.get(name), kind) for name, kind in kinds.items()):
+        return False
+    for name, entry in record["outputs"].items():
+        path = PurePosixPath(name)
+        if not isinstance(entry, dict) or path.is_absolute() or not {"..", "."}.isdisjoint(name.split("/")):
+            return False
+        if not name.isprintable() or not entry.get("volatile") and not _is_hashed(entry):
+            return False
+    return True
+
+
+def _is_hashed(entry: Mapping[str, object]) -> bool:
+    return isinstance(entry.get("sha256"), str) and isinstance(entry.get("bytes"), int)
 
 
 def write_record(path: Path, record: Mapping[str, object]) -> None:
@@ -149,7 +176,7 @@ def damage(folder: Path, manifest: Mapping[str, object], memory: HashMemory) -> 
     faults = []
     for name, entry in manifest["outputs"].items():
         path = folder / name
-        if not path.is_file():
+        if path.is_symlink() or not path.is_file():
             faults.append(f"file {name} is missing")
         elif not entry.get("volatile") and not _is_sound(path, entry, memory):
             faults.append(f"file {name} is damaged")

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+from shared.contract.confine import is_trusted
 from shared.contract.declare import Parameter, Stage
 from shared.contract.source import read_declaration
 from shared.contract.wording import check_keys, nearest, read_yaml, unknown_name
-from shared.errors import InputError
+from shared.errors import InputError, shown
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEFAULT_PIPELINE = REPOSITORY / "pipeline.yaml"
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}\Z")
 _THREADS = Parameter("threads", int, None, "Cores of one job.", "cores", 1, 4096)
 _RESOURCE = Parameter("resource", int, 1, "What a cluster books for one job.", "", 1)
 
@@ -41,9 +44,19 @@ class Pipeline:
 
     @cached_property
     def root(self) -> Path:
-        """The folder that holds the stages' package: beside pipeline.yaml, else the repository."""
+        """The folder that holds the stages' package: beside pipeline.yaml, else the repository.
+
+        InputError for a package beside a pipeline.yaml for whose folder nobody vouches: its stages are code.
+        """
         own = self.path.parent.joinpath(*self.package.split("."))
-        return self.path.parent if own.is_dir() else REPOSITORY
+        if not own.is_dir() or self.path.parent == REPOSITORY:
+            return REPOSITORY
+        if self.package == "stages":
+            return REPOSITORY
+        if not is_trusted(own):
+            raise InputError("stages of its own are code that would be run", where=str(self.path), got=str(own),
+                             mend=f"if you know them: --trust {self.path.parent}")
+        return self.path.parent
 
     @cached_property
     def stages(self) -> dict[str, Stage]:
@@ -69,8 +82,8 @@ class Pipeline:
             raise unknown_name("preset", preset, self.presets, str(self.path))
         step = self.steps.get(stage.name)
         where = f"{self.path}: stages.{stage.name}.parameters"
-        values = stage.defaults() | stage.parse(step.parameters if step else {}, where)
-        values |= stage.parse(self.presets[preset].get(stage.name, {}), f"{self.path}: presets.{preset}")
+        values = stage.defaults() | _without_files(stage, step.parameters if step else {}, where)
+        values |= _without_files(stage, self.presets[preset].get(stage.name, {}), f"{self.path}: presets.{preset}")
         return values | stage.parse(given, "--set")
 
     def check(self) -> None:
@@ -80,6 +93,14 @@ class Pipeline:
                 self.parameters(stage, preset, {})
 
 
+def _without_files(stage: Stage, values: Mapping[str, object], where: str) -> dict[str, object]:
+    """Values of pipeline.yaml, parsed; InputError where one names a file, which only the operator may."""
+    for name in (p.name for p in stage.parameters if p.file and values.get(p.name)):
+        raise InputError("a file may be named on the command line only", where=f"{where}: {stage.name}.{name}",
+                         mend=f"leave it out here and add --set {stage.name}.{name}=FILE")
+    return stage.parse(values, where)
+
+
 def load_pipeline(path: Path | None = None) -> Pipeline:
     """Reads pipeline.yaml (the repository's by default) and checks its structure; InputError where it is wrong."""
     path = Path(path).absolute() if path else DEFAULT_PIPELINE
@@ -87,17 +108,29 @@ def load_pipeline(path: Path | None = None) -> Pipeline:
         raise InputError("no such file", where=str(path), mend="give the pipeline with --pipeline FILE")
     content = check_keys(read_yaml(path), ("package", "stages", "presets", "default_preset"), str(path))
     given = check_keys(content.get("stages"), _Anything(), f"{path}: stages")
-    steps = {str(name): _step(value, f"{path}: stages.{name}") for name, value in given.items()}
+    for name in given:
+        if not _is_name(name):
+            raise InputError("not a stage's name", where=f"{path}: stages", got=shown(name), expected="snake_case")
+    steps = {name: _step(value, f"{path}: stages.{name}") for name, value in given.items()}
     if not steps:
         raise InputError("no stages", where=str(path))
     steps = _in_order(steps, path)
     presets = check_keys(content.get("presets"), _Anything(), f"{path}: presets")
-    presets = {str(name): _preset(value, steps, f"{path}: presets.{name}") for name, value in presets.items()}
-    default = str(content.get("default_preset", "standard"))
+    presets = {str(name): _preset(value, steps, f"{path}: presets.{shown(name)}") for name, value in presets.items()}
+    default, package = content.get("default_preset", "standard"), content.get("package", "stages")
+    for key, value in (("default_preset", default), ("package", package)):
+        if not isinstance(value, str):
+            raise InputError("not a name", where=f"{path}: {key}", got=shown(value))
+    if not all(map(_is_name, package.split("."))):
+        raise InputError("not a Python package's name", where=f"{path}: package", got=shown(package))
     presets = presets or {default: {}}
     if default not in presets:
         raise unknown_name("preset", default, presets, f"{path}: default_preset")
-    return Pipeline(path, str(content.get("package", "stages")), steps, presets, default)
+    return Pipeline(path, package, steps, presets, default)
+
+
+def _is_name(value: object) -> bool:
+    return isinstance(value, str) and _NAME.match(value) is not None
 
 
 class _Anything:
@@ -111,7 +144,7 @@ def _step(value: object, where: str) -> Step:
     given = check_keys(value, ("needs", "threads", "resources", "parameters"), where)
     needs = given.get("needs") or []
     if not isinstance(needs, list):
-        raise InputError("not a list of stages", where=f"{where}.needs", got=repr(needs))
+        raise InputError("not a list of stages", where=f"{where}.needs", got=shown(needs))
     resources = check_keys(given.get("resources"), ("mem_mb", "runtime", "disk_mb"), f"{where}.resources")
     booked = {name: _RESOURCE.parse(amount, f"{where}.resources.{name}") for name, amount in resources.items()}
     threads = _THREADS.parse(given.get("threads"), f"{where}.threads")

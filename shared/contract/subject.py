@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
+from shared.contract.confine import check_link, inside
 from shared.contract.declare import Parameter
 from shared.contract.wording import check_keys, nearest, read_yaml
-from shared.errors import InputError
+from shared.errors import InputError, shown
 
 TRANSFERS = ("srgb", "bt709", "linear")
 MOVES = ("head", "camera")
 GIVEN = ("landmarks", "poses")
 """Files that a user may bring from another tracker."""
+LARGEST_BYTES = 1 << 36
+MOST_FILES = 100_000
 
 _COUNTER = re.compile(r"%(?:0?(\d+))?d")
 _CAMERA = (
@@ -78,12 +81,23 @@ def _listing(folder: Path) -> list[Path]:
 
 def load_subject(folder: Path) -> Subject:
     """Reads and checks folder/subject.yaml and that the video is there; InputError otherwise."""
-    folder = Path(folder).absolute()
+    try:
+        return _load(Path(folder).absolute())
+    except OSError as error:
+        raise InputError("cannot be read", where=str(error.filename or folder), got=error.strerror) from error
+
+
+def _load(folder: Path) -> Subject:
     path = folder / "subject.yaml"
     if not folder.is_dir():
         raise InputError("no such folder", where=str(folder), mend=_NEW)
     if not path.is_file():
         raise InputError("no subject.yaml in this folder", where=str(folder), mend=_NEW)
+    name = folder.resolve().name
+    if not name.isprintable() or not name:
+        raise InputError("the folder's name cannot be used", where=str(folder), expected="printable letters in UTF-8",
+                         mend="rename it")
+    check_link(path, folder)
     content = check_keys(read_yaml(path), ("video", "camera", "colour", "capture", "tracking"), str(path))
     camera = _camera(check_keys(content.get("camera"), [p.name for p in _CAMERA], f"{path}: camera"), path)
     colour = check_keys(content.get("colour"), ("transfer",), f"{path}: colour")
@@ -92,7 +106,7 @@ def load_subject(folder: Path) -> Subject:
     transfer = _choice(colour.get("transfer", "srgb"), TRANSFERS, f"{path}: colour.transfer")
     moves = _choice(capture.get("moves", "head"), MOVES, f"{path}: capture.moves")
     given = _tracking(folder, content.get("tracking"), f"{path}: tracking")
-    subject = Subject(folder, folder.resolve().name, video, transfer=transfer, moves=moves, **camera, **given)
+    subject = Subject(folder, name, video, transfer=transfer, moves=moves, **camera, **given)
     _check_files(subject)
     return subject
 
@@ -109,36 +123,26 @@ def _camera(given: dict, path: Path) -> dict[str, float | None]:
 
 
 def _choice(value: object, known: tuple[str, ...], where: str) -> str:
-    if value not in known:
-        raise InputError("value not known", where=where, got=repr(value),
-                         expected=" | ".join(known), mend=nearest(str(value).lower(), known))
+    if not isinstance(value, str) or value not in known:
+        raise InputError("value not known", where=where, got=shown(value),
+                         expected=" | ".join(known), mend=nearest(shown(value).strip("'\"").lower(), known))
     return str(value)
 
 
 def _tracking(folder: Path, given: object, where: str) -> dict[str, object]:
     """Files of another tracker, and whether its poses are held."""
     given = check_keys(given, (*GIVEN, "hold_poses"), where)
-    files = {name: _inside(folder, given[name], f"{where}.{name}") for name in GIVEN if given.get(name) is not None}
+    files = {name: inside(folder, given[name], f"{where}.{name}") for name in GIVEN if given.get(name) is not None}
     for name, file in files.items():
         if not file.is_file() or file.stat().st_size == 0:
             raise InputError("no such file, or empty", where=f"{where}.{name}", got=given[name])
+        check_link(file, folder)
     hold = given.get("hold_poses", False)
     if not isinstance(hold, bool):
-        raise InputError("value not known", where=f"{where}.hold_poses", got=repr(hold), expected="true | false")
+        raise InputError("value not known", where=f"{where}.hold_poses", got=shown(hold), expected="true | false")
     if hold and "poses" not in files:
         raise InputError("hold_poses without poses", where=where, mend="add poses: FILE.npz, or leave hold_poses out")
     return {**files, "hold_poses": hold}
-
-
-def _inside(folder: Path, value: object, where: str) -> Path:
-    """The absolute path of a file that is named by a path which stays inside the subject's folder."""
-    if not isinstance(value, str) or not value.strip():
-        raise InputError("no file named", where=where, expected="a file in the subject's folder")
-    relative = PurePosixPath(value)
-    if relative.is_absolute() or ".." in relative.parts or "\\" in value or "\0" in value:
-        raise InputError("the path leaves the subject's folder", where=where, got=value,
-                         expected="a path inside it (a symbolic link there may point elsewhere)")
-    return folder / relative
 
 
 def _video(folder: Path, value: object, path: Path) -> Path:
@@ -146,7 +150,7 @@ def _video(folder: Path, value: object, path: Path) -> Path:
     where = f"{path}: video"
     if not isinstance(value, str) or not value.strip():
         raise InputError("no video named", where=where, expected="a file in the subject's folder, e.g. clip.mp4")
-    file = _inside(folder, value, where)
+    file = inside(folder, value, where)
     if len(_COUNTER.findall(value)) > len(_COUNTER.findall(file.name)) or len(_COUNTER.findall(value)) > 1:
         raise InputError("more than one counter, or one in a folder's name", where=where, got=value,
                          expected="one in the file's name, e.g. frames/%05d.png")
@@ -158,10 +162,16 @@ def _check_files(subject: Subject) -> None:
     files = subject.video_files()
     if not files:
         raise InputError("no such video", where=where, mend="correct 'video' in subject.yaml or put the file there")
+    if len(files) > MOST_FILES:
+        raise InputError("too many images", where=where, got=len(files), expected=f"{MOST_FILES} or fewer",
+                         mend="cut out the head turn")
+    total = 0
     for file in files:
-        try:
-            size = file.stat().st_size
-        except OSError as error:
-            raise InputError("cannot be read", where=str(file), got=error.strerror) from error
+        check_link(file, subject.folder)
+        size = file.stat().st_size
+        total += size
         if size == 0:
             raise InputError("the file is empty", where=str(file), mend="copy it from the camera again")
+    if total > LARGEST_BYTES:
+        raise InputError("the clip is too large", where=where, got=f"{total / 1e9:.0f} GB",
+                         expected=f"{LARGEST_BYTES / 1e9:.0f} GB or less", mend="cut out the head turn")

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import difflib
+import stat
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import yaml
 
-from shared.errors import InputError
+from shared.errors import InputError, shown
 
-LARGEST_YAML_BYTES = 1 << 20
+LARGEST_YAML_BYTES = 1 << 16
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """'did you mean ...?' where one of the known names is close to `name`, else the list of them."""
     known = sorted(known)
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(name[:80], known, n=1, cutoff=0.5)
     return f"did you mean {close[0]}?" if close else f"known: {', '.join(known) or 'none'}"
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], where: str) -> InputError:
     """The error for a name that nobody declared."""
-    return InputError(f"unknown {kind} {str(name)!r}", where=where, mend=nearest(str(name), known))
+    return InputError(f"unknown {kind} {shown(name)}", where=where, mend=nearest(shown(name).strip("'\""), known))
 
 
 def check_keys(mapping: object, known: Collection[str], where: str) -> dict:
@@ -30,7 +31,7 @@ def check_keys(mapping: object, known: Collection[str], where: str) -> dict:
     if mapping is None:
         return {}
     if not isinstance(mapping, dict):
-        raise InputError("not a mapping of keys to values", where=where, got=repr(mapping))
+        raise InputError("not a mapping of keys to values", where=where, got=shown(mapping))
     for key in mapping:
         if key not in known:
             raise unknown_name("key", key, known, where)
@@ -38,24 +39,30 @@ def check_keys(mapping: object, known: Collection[str], where: str) -> dict:
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Safe YAML in which a key that is given twice is an error instead of the last one winning."""
+    """Safe YAML in which a key that is given twice is an error instead of the last one winning.
+
+    No aliases: a few lines of them can stand for billions of values.
+    """
+
+    def compose_node(self, parent: yaml.Node | None, index: object) -> yaml.Node:
+        if self.check_event(yaml.AliasEvent):
+            mark = self.peek_event().start_mark
+            raise yaml.MarkedYAMLError(problem="aliases (*name) are not allowed here", problem_mark=mark)
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for i, key in enumerate(keys):
-            if key in keys[:i]:
-                raise yaml.MarkedYAMLError(problem=f"key {key!r} is given twice", problem_mark=node.start_mark)
+        seen = set()
+        for key in (self.construct_object(key, deep=True) for key, _ in node.value):
+            if key in seen:
+                problem = f"key {shown(key)} is given twice"
+                raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+            seen.add(key)
         return super().construct_mapping(node, deep)
 
 
 def read_yaml(path: Path) -> object:
     """The content of a small YAML file, by the safe loader; InputError with the line when it is not valid."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError("cannot be read", where=str(path), got=error.strerror) from error
-    if len(data) > LARGEST_YAML_BYTES:
-        raise InputError("too large for a settings file", where=str(path), got=f"{len(data)} bytes")
+    data = _read_settings(path)
     try:
         return yaml.load(data.decode("utf-8"), Loader=_StrictLoader)
     except UnicodeDecodeError as error:
@@ -65,3 +72,17 @@ def read_yaml(path: Path) -> object:
         line = f", line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise InputError("not valid YAML", where=f"{path}{line}", got=problem) from error
+
+
+def _read_settings(path: Path) -> bytes:
+    """The bytes of a settings file; InputError for what is too large, or no file at all."""
+    try:
+        facts = path.stat()
+        if not stat.S_ISREG(facts.st_mode):
+            raise InputError("not a file", where=str(path))
+        if facts.st_size > LARGEST_YAML_BYTES:
+            raise InputError("too large for a settings file", where=str(path), got=f"{facts.st_size} bytes",
+                             expected=f"{LARGEST_YAML_BYTES} or fewer")
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError("cannot be read", where=str(path), got=error.strerror) from error

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
 
 from shared.errors import InputError
 
+LARGEST_BYTES = 1 << 33
 _EPOCH = (1980, 1, 1, 0, 0, 0)
+_MOST_ARRAYS = 1000
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def save_arrays(path: Path | str, **arrays: np.ndarray) -> None:
@@ -23,15 +29,39 @@ def save_arrays(path: Path | str, **arrays: np.ndarray) -> None:
             archive.writestr(zipfile.ZipInfo(f"{name}.npy", _EPOCH), buffer.getvalue(), zipfile.ZIP_DEFLATED)
 
 
-def load_arrays(path: Path | str) -> dict[str, np.ndarray]:
-    """Reads an .npz of plain arrays. InputError when it is missing, damaged or needs pickle."""
+def load_arrays(path: Path | str, largest_bytes: int = LARGEST_BYTES) -> dict[str, np.ndarray]:
+    """Reads an .npz of plain arrays. InputError when it is missing, damaged, needs pickle, or would need more memory
+    than largest_bytes: a few kilobytes of zip can hold gigabytes, and a header can claim any shape.
+    """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            if sum(member.file_size for member in members) > largest_bytes or len(members) > _MOST_ARRAYS:
+                raise InputError("too much in the file", where=str(path), expected=f"{largest_bytes >> 20} MiB at most")
+            return {member.filename.removesuffix(".npy"): _read_array(archive, member) for member in members}
     except FileNotFoundError as error:
         raise InputError("file is missing", where=str(path)) from error
-    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:  # TypeError: a lone .npy
+    except (ValueError, OSError, EOFError, RuntimeError, NotImplementedError, MemoryError, SyntaxError,
+            zipfile.BadZipFile, zlib.error) as error:
         raise InputError("not a readable .npz of plain arrays", where=str(path), got=error) from error
+
+
+def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """One member; ValueError where it is no plain array, or not as long as its header says."""
+    if member.compress_type not in _METHODS:
+        raise ValueError(f"{member.filename}: compressed in a way that is not used for arrays")
+    data = io.BytesIO(archive.read(member))
+    version = np.lib.format.read_magic(data)
+    if version not in _HEADERS:
+        raise ValueError(f"{member.filename}: format {version}")
+    shape, fortran, dtype = _HEADERS[version](data)
+    if dtype.hasobject or dtype.kind not in "biufcSU" or dtype.itemsize == 0:
+        raise ValueError(f"{member.filename}: holds {dtype}, not plain numbers or text")
+    count = math.prod(shape)
+    if any(edge < 0 for edge in shape) or count * dtype.itemsize != len(data.getbuffer()) - data.tell():
+        raise ValueError(f"{member.filename}: another length than its header says")
+    values = np.frombuffer(data.getbuffer(), dtype, count, data.tell()).copy()
+    return values.reshape(shape, order="F" if fortran else "C")
 
 
 def write_json(path: Path | str, content: object) -> None:
@@ -45,5 +75,5 @@ def read_json(path: Path | str) -> dict:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise InputError("file is missing", where=str(path)) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError("not valid JSON", where=str(path), got=error) from error

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from shared.color import decode_transfer
+from shared.errors import InputError
 from shared.io.arrays import read_json
 from shared.io.images import read_png
+
+_FILE = re.compile(r"(frames|masks)/\d{6,9}\.png")
 
 
 @dataclass(frozen=True)
@@ -42,10 +46,15 @@ class FrameSet:
         folder = Path(folder)
         content = read_json(folder / "frames.json")
         frames, source, crop = content["frames"], content["source"], content["crop"]
+        names = [(frame["file"], frame["mask"]) for frame in frames]
+        for name in [name for pair in names for name in pair]:
+            if not _FILE.fullmatch(name):
+                raise InputError("not the name of a sampled frame", where=str(folder / "frames.json"), got=name,
+                                 mend="remove the folder and run again")
         return cls(
             folder=folder,
-            files=tuple(frame["file"] for frame in frames),
-            mask_files=tuple(frame["mask"] for frame in frames),
+            files=tuple(file for file, _ in names),
+            mask_files=tuple(mask for _, mask in names),
             frame_index=np.array([frame["frame_index"] for frame in frames], np.int64),
             time_s=np.array([frame["time_s"] for frame in frames]),
             fps=float(source["fps"]),

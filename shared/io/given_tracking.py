@@ -17,12 +17,16 @@ from shared.landmarks import LANDMARK_COUNT
 
 LARGEST_SKEW = 1e-3
 LEAST_FRAMES = 3
+LARGEST_BYTES = 1 << 28
+FARTHEST_PX, FARTHEST = 1e5, 1e7
 
 
 def read_given_landmarks(path: Path, frame_index: np.ndarray, crop: tuple[float, float, float]):
     """-> landmarks [F, 468, 2] px of the crop (x0, y0, scale), 0 where the file has none, and which it has [F] bool."""
     arrays = _read(path, "landmarks_px", (LANDMARK_COUNT, 2))
     place, row = _match(path, arrays["frame_index"], frame_index)
+    if np.abs(arrays["landmarks_px"]).max() > FARTHEST_PX:
+        raise InputError("landmarks far outside any picture", where=str(path), expected="px of the source frame")
     points = np.zeros((len(frame_index), LANDMARK_COUNT, 2))
     points[place] = (arrays["landmarks_px"][row] - crop[:2]) * crop[2]
     return points, _marked(place, len(frame_index))
@@ -32,11 +36,14 @@ def read_given_poses(path: Path, frame_index: np.ndarray) -> tuple[np.ndarray, n
     """-> poses [F, 4, 4], identity where the file has none, and which it has [F] bool."""
     arrays = _read(path, "camera_from_head", (4, 4))
     poses = arrays["camera_from_head"]
-    skew = np.abs(poses[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2) - np.eye(3)).max()
-    if skew > LARGEST_SKEW or np.linalg.det(poses[:, :3, :3]).min() < 0 or np.abs(poses[:, 3] - [0, 0, 0, 1]).max() > 0:
+    rotations = poses[:, :3, :3]
+    sane = np.abs(rotations).max() < 2 and np.abs(poses[:, 3] - [0, 0, 0, 1]).max() == 0
+    if not sane or _skew(rotations) > LARGEST_SKEW or np.linalg.det(rotations).min() < 0:
         raise InputError("the poses are not rigid", where=str(path), expected="rotations with last row 0 0 0 1")
     if poses[:, 2, 3].min() <= 0:
         raise InputError("the head is behind the camera", where=str(path), expected="OpenCV axes, z forward")
+    if np.abs(poses[:, :3, 3]).max() > FARTHEST or poses[:, 2, 3].min() < 1 / FARTHEST:
+        raise InputError("the head is nowhere near the camera", where=str(path), expected=f"1e-7 .. {FARTHEST:g} units")
     place, row = _match(path, arrays["frame_index"], frame_index)
     found = np.repeat(np.eye(4)[None], len(frame_index), axis=0)
     found[place] = poses[row]
@@ -44,7 +51,7 @@ def read_given_poses(path: Path, frame_index: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _read(path: Path, name: str, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
-    arrays = load_arrays(path)
+    arrays = load_arrays(path, LARGEST_BYTES)
     for key in (name, "frame_index"):
         if key not in arrays:
             raise InputError(f"no {key} in the file", where=str(path), got=", ".join(sorted(arrays)))
@@ -59,6 +66,11 @@ def _read(path: Path, name: str, shape: tuple[int, ...]) -> dict[str, np.ndarray
     if len(frames) < LEAST_FRAMES:
         raise InputError("too few of the clip's frames in it", where=str(path), got=len(frames), expected="3 or more")
     return {name: values.astype(np.float64), "frame_index": frames.astype(np.int64)}
+
+
+def _skew(rotations: np.ndarray) -> float:
+    """How far the matrices [n, 3, 3] are from orthonormal."""
+    return float(np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max())
 
 
 def _match(path: Path, given: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 
 from shared.errors import InputError
-from shared.io.images import read_exr
+from shared.io.images import exr_size, read_exr
 from shared.io.pixel_format import has_alpha
 from shared.io.source import (
     DEFAULT_FPS,
@@ -114,8 +114,8 @@ def _is_exr(file: Path) -> bool:
 
 def _read_linear_exr(index: int, time_s: float, file: Path) -> SourceFrame:
     try:
+        check_size(*exr_size(file), str(file))
         linear = read_exr(file)
-        check_size(linear.shape[1], linear.shape[0], str(file))
     except InputError as error:
         return SourceFrame(index, time_s, error.what)
     if not np.isfinite(linear).all():

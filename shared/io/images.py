@@ -115,27 +115,45 @@ def _header(colour_space: str, attributes: dict, latlong: bool) -> dict:
 
 
 def read_exr(path: Path | str) -> np.ndarray:
-    """-> float32 [H, W] or [H, W, 3]. InputError when the file is missing, truncated or not an EXR."""
+    """-> float32 [H, W] or [H, W, 3]. InputError when the file is missing, truncated or not an EXR of that kind."""
     try:
         with OpenEXR.File(str(path)) as file:
             if not file.parts:
                 raise InputError("truncated or empty EXR", where=str(path))
-            channels = file.channels()
-            for name in ("RGB", "RGBA"):
-                if name in channels:
-                    return channels[name].pixels[..., :3].astype(np.float32)
-            if all(name in channels for name in "RGB"):
-                return np.stack([channels[name].pixels for name in "RGB"], axis=-1).astype(np.float32)
-            return next(iter(channels.values())).pixels.astype(np.float32)
-    except RuntimeError as error:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError, TypeError, MemoryError) as error:
         raise InputError("not a readable EXR", where=str(path), got=error) from error
+    colour = next((channels[name] for name in ("RGB", "RGBA") if name in channels), None)
+    if colour is None and all(name in channels for name in "RGB") and len({channels[c].shape for c in "RGB"}) == 1:
+        colour = np.stack([channels[name] for name in "RGB"], axis=-1)
+    if colour is None and len(channels) == 1:
+        colour = next(iter(channels.values()))
+    if colour is None or colour.ndim not in (2, 3) or (colour.ndim == 3 and colour.shape[2] < 3):
+        raise InputError("an EXR of other channels", where=str(path), got=", ".join(sorted(channels)) or "none",
+                         expected="R, G, B or one channel")
+    return (colour if colour.ndim == 2 else colour[..., :3]).astype(np.float32)
+
+
+def exr_size(path: Path | str) -> tuple[int, int]:
+    """(width, height) as the header states it, without reading a pixel. InputError when it is not an EXR."""
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            window = file.header()["dataWindow"] if file.parts else None
+    except (RuntimeError, ValueError, TypeError, KeyError) as error:
+        raise InputError("not a readable EXR", where=str(path), got=error) from error
+    if window is None:
+        raise InputError("truncated or empty EXR", where=str(path))
+    (x0, y0), (x1, y1) = (np.asarray(corner, np.int64).tolist() for corner in window)
+    return x1 - x0 + 1, y1 - y0 + 1
 
 
 def write_png(path: Path | str, array: np.ndarray) -> None:
     """Writes [H, W] or [H, W, 3] RGB, uint8 or uint16, losslessly."""
     ordered = array[..., ::-1] if array.ndim == 3 else array
-    if not cv2.imwrite(str(path), np.ascontiguousarray(ordered), [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise LimnError(f"{path}: could not be written")
+    done, data = cv2.imencode(".png", np.ascontiguousarray(ordered), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not done:
+        raise LimnError(f"{path}: could not be encoded")
+    Path(path).write_bytes(data)  # imwrite would not say that the disk is full
 
 
 def read_png(path: Path | str) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import av
 import cv2
 import numpy as np
 
@@ -12,13 +13,13 @@ from shared.errors import InputError
 from shared.io.pixel_format import rgb_codes
 
 if TYPE_CHECKING:
-    import av
     from av.video.reformatter import VideoReformatter
 
 MIN_SIDE_PX = 16
 MAX_PIXELS = 7680 * 4352
 MAX_FRAMES = 20_000
 DEFAULT_FPS = 25.0
+MEND_CODEC = "re-encode it: ffmpeg -i IN -pix_fmt yuv420p -c:v libx264 -crf 12 OUT.mp4"
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,11 @@ class DecodedFrame(SourceFrame):
     def codes(self, size: tuple[int, int] | None = None) -> np.ndarray:
         """See SourceFrame."""
         stored_size = size[::-1] if size and self.quarter_turns % 2 else size
-        codes = rgb_codes(self.reformatter, self.picture, stored_size)
+        try:
+            codes = rgb_codes(self.reformatter, self.picture, stored_size)
+        except (av.error.FFmpegError, ValueError) as error:
+            raise InputError("pixels in a format that cannot be converted", where=f"frame {self.index}",
+                             got=self.picture.format.name, mend=MEND_CODEC) from error
         return np.ascontiguousarray(np.rot90(codes, self.quarter_turns))
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import Collection, Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -28,6 +29,8 @@ CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,gif,mpegts,mpeg,ogg,flv,
 # Containers may count a few frames that never show (edit lists, a cut-off group of pictures at the end).
 COMPLETE_SHARE = 0.95
 MAX_THREADS = 4
+MAX_STALL_CPU_S, MAX_READ_CPU_S = 60.0, 7200.0
+"""Processor seconds for one frame and for reading the clip once. Not wall seconds: a busy machine is no fault."""
 _TRANSFER_TAGS = {1: "bt709", 4: "gamma22", 6: "bt601", 8: "linear", 13: "srgb", 14: "bt2020", 15: "bt2020",
                   16: "pq", 18: "hlg"}
 _MEND_DAMAGED = "copy the file again from the camera, or re-encode it: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4"
@@ -164,9 +167,13 @@ def _video_stream(container: av.container.InputContainer, path: Path) -> av.Vide
 
 
 def _pictures(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.VideoFrame]:
-    """Decoded pictures; packets that cannot be decoded are passed over, a broken file ends the stream."""
-    packets = container.demux(stream)
+    """Decoded pictures; packets that cannot be decoded are passed over, a broken file ends the stream.
+
+    InputError where a picture, or all of them, take more processor time than any real clip needs.
+    """
+    packets, spent, since_picture = container.demux(stream), 0.0, 0.0
     while True:
+        start = time.process_time()
         try:
             packet = next(packets, None)
         except av.error.FFmpegError:
@@ -174,9 +181,15 @@ def _pictures(container: av.container.InputContainer, stream: av.VideoStream) ->
         if packet is None:
             return
         try:
-            yield from packet.decode()
-        except (av.error.InvalidDataError, av.error.EOFError):
-            continue
+            pictures = packet.decode()
+        except (av.error.FFmpegError, MemoryError):
+            pictures = []
+        seconds = time.process_time() - start
+        spent, since_picture = spent + seconds, 0.0 if pictures else since_picture + seconds
+        if max(seconds, since_picture) > MAX_STALL_CPU_S or spent > MAX_READ_CPU_S:
+            raise InputError("decoding takes too long", where=container.name.removeprefix("file:"),
+                             got=f"{spent:.0f} processor seconds", mend="cut out the head turn, or scale the clip down")
+        yield from pictures
 
 
 def _frame_rate(stream: av.VideoStream) -> float:
