@@ -172,7 +172,10 @@ def test_one_failing_subject_does_not_stop_the_others(pipeline, subject, tmp_pat
     code, output = limn("run", faceless, subject, "--pipeline", pipeline, "--set", "count_words.least=2")
     assert code == 2 and (subject / "export" / "page.txt").is_file() and tree(faceless) == before
     lines = [line for line in output.splitlines() if "no face" in line]
-    assert len(lines) == 1 and lines[0].endswith("clip.txt: no face in the clip; film a face")
+    assert len(lines) == 2 and lines[0].endswith("clip.txt: no face in the clip; film a face")
+    assert re.match(r"faceless  read_text +input error +0.0 +0 MB  ", lines[1])
+    assert re.search(r"anna +export_page +done +0\.\d +\d+ MB$", output, re.M)
+    assert output.endswith("2 subjects: 1 done, 1 input error\n")
     assert "faceless: not done; not run: count_words, draw_bars, export_page" in output
     code, output = limn("run", faceless, subject, "--pipeline", pipeline, TOY_FAIL="1")
     assert code == 1 and re.search(r"count_words +failed: ValueError: the abacus broke", output)
@@ -185,8 +188,7 @@ def test_faults_are_told_before_anything_starts(pipeline, subject, tmp_path, cap
     other = make_subject(tmp_path / "otto", settings="video: gone.mp4\n")
     (tmp_path / "bare").mkdir()
     before = tree(tmp_path)
-    given = ["run", *map(str, (subject, other, tmp_path / "bare")), "--pipeline", str(pipeline)]
-    assert main(given) == 2
+    assert main(["run", str(other), str(tmp_path / "bare"), "--pipeline", str(pipeline)]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2 and "gone.mp4: no such video" in lines[0] and "no subject.yaml" in lines[1]
     for settings, hint in ((["--set", "draw_bars.widht=3"], "draw_bars.width?"),

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from shared.contract.folders import RunFolder
 from shared.contract.pipeline import Pipeline, split_settings
 from shared.contract.subject import Subject, load_subject
 from shared.errors import InputError
+
+LARGEST_LIST_BYTES = 1 << 24
 
 
 class InputErrors(InputError):
@@ -33,21 +35,57 @@ class Case:
         return self.subject.name
 
 
-def open_cases(folders: Sequence[Path], out: Path | None) -> list[Case]:
-    """Subjects, checked; InputErrors with one line for each that is wrong."""
-    cases, errors = [], []
+@dataclass(frozen=True)
+class Opened:
+    """The subjects of a call. faults: (folder, what is wrong) of those that cannot be worked on."""
+
+    cases: list[Case] = field(default_factory=list)
+    faults: list[tuple[Path, InputError]] = field(default_factory=list)
+
+    def all(self) -> list[Case]:
+        """All subjects; InputErrors where one is at fault."""
+        if self.faults:
+            raise InputErrors([error for _, error in self.faults])
+        return self.cases
+
+
+def find_subjects(folders: Sequence[Path], list_file: Path | None = None) -> list[Path]:
+    """Subject folders: a folder without subject.yaml stands for those in it that have one; a list names one a line."""
+    found: list[Path] = []
+    for folder in [*folders, *(_listed(list_file) if list_file else ())]:
+        inside = [] if (folder / "subject.yaml").exists() or not folder.is_dir() else sorted(folder.iterdir())
+        found += [path for path in inside if (path / "subject.yaml").exists()] or [folder]
+    if not found:
+        raise InputError("no subjects", mend="give folders with subject.yaml, a folder of such, or --list FILE")
+    return found
+
+
+def _listed(path: Path) -> list[Path]:
+    """The folders that a list names, relative to it; '#' starts a comment."""
+    try:
+        with open(path, encoding="utf-8") as file:
+            lines = file.read(LARGEST_LIST_BYTES).splitlines()
+    except (OSError, ValueError) as error:
+        raise InputError("cannot be read as a list of subjects", where=str(path), got=error) from error
+    names = [line.partition("#")[0].strip() for line in lines]
+    return [path.parent / name for name in names if name]
+
+
+def open_cases(folders: Sequence[Path], out: Path | None) -> Opened:
+    """The subjects, checked, and the faults; InputErrors where two of them would write to one place."""
+    opened = Opened()
     for folder in folders:
         try:
             subject = load_subject(folder)
-            cases.append(Case(subject, RunFolder.of(subject.folder, subject.name, out)))
+            opened.cases.append(Case(subject, RunFolder.of(subject.folder, subject.name, out)))
         except InputError as error:
-            errors.append(error)
-    roots = [case.run.root.resolve() for case in cases]
-    errors += [InputError("given twice, or two subjects of one name", where=str(case.subject.folder), mend="rename one")
-               for i, case in enumerate(cases) if roots[i] in roots[:i]]
-    if errors:
-        raise InputErrors(errors)
-    return cases
+            opened.faults.append((folder, error))
+    roots = [case.run.root.resolve() for case in opened.cases]
+    twice = [InputError("given twice, or two subjects of one name", where=str(case.subject.folder), mend="rename one")
+             for i, case in enumerate(opened.cases) if roots[i] in set(roots[:i])]
+    if twice:
+        raise InputErrors(twice)
+    return opened
 
 
 def all_parameters(pipeline: Pipeline, preset: str | None, settings: Sequence[str]) -> dict[str, dict[str, object]]:

@@ -1,61 +1,45 @@
-"""What limn shows and removes besides running: status, clean, report."""
+"""What limn does besides running: clean, report."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from shared.contract.folders import RunFolder
-from shared.contract.manifest import PROVENANCE, read_record
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
 from tools.cases import Case
+from tools.gates import PICTURE, RECORD
 from tools.plan import StagePlan
 from tools.workflow import clear_leftovers
-
-
-def status_lines(case: Case, plans: Mapping[str, StagePlan]) -> list[str]:
-    """Folder, size, times and peak memory of each stage."""
-    lines = [f"{case.name}: {case.run.root}",
-             f"  {'stage':16} {'state':9} {'size':>10} {'seconds':>8} {'peak':>9}  {'started':25}  folder"]
-    for name, plan in plans.items():
-        folder = case.run.published(name)
-        provenance = read_record(folder / PROVENANCE) or {}
-        size = readable_size(folder_size(folder)) if folder.is_dir() else "-"
-        seconds = f"{provenance['wall_s']:.1f}" if "wall_s" in provenance else "-"
-        peak = f"{provenance['peak_memory_mb']:.0f} MB" if "peak_memory_mb" in provenance else "-"
-        started = provenance.get("started", "-")
-        place = folder.relative_to(case.run.root) if folder.is_dir() else "-"
-        lines.append(f"  {name:16} {plan.state:9} {size:>10} {seconds:>8} {peak:>9}  {started:25}  {place}")
-        if case.run.failed(name).is_dir():
-            lines.append(f"  {'':16} failed: {case.run.failed(name) / 'log.txt'}")
-    return lines
 
 
 def removable(run: RunFolder, pipeline: Pipeline) -> list[Path]:
     """What clean removes: what the pipeline has written under work/, never export/, never anything else."""
     names = tuple(pipeline.steps)
     paths = [run.work / name for name in names] + [run.failed(name) for name in names]
-    paths += [run.stamp(name) for name in names] + [run.memory, run.work / "workflow.log"]
+    paths += [run.stamp(name) for name in names]
+    paths += [run.memory, *(run.work / name for name in ("workflow.log", RECORD, PICTURE))]
     return [path for path in paths if path.exists()]
 
 
-def clean(run: RunFolder, pipeline: Pipeline, dry_run: bool) -> list[str]:
-    """Removes the run's work; returns a line for each path, and the sum."""
+def clean(run: RunFolder, pipeline: Pipeline, dry_run: bool) -> Iterator[str]:
+    """Removes the run's work; gives a line for each path before that path goes, and the sum."""
     if not run.work.is_dir():
-        return [f"{run.work}: nothing to remove"]
-    lines, total = [], 0
+        yield f"{run.work}: nothing to remove"
+        return
+    total = 0
     with run.locked("run"):
         if not dry_run:
             clear_leftovers(run, pipeline)
         for path in removable(run, pipeline):
             size = folder_size(path) if path.is_dir() else path.stat().st_size
             total += size
-            lines.append(f"{'would remove' if dry_run else 'remove'} {path} ({readable_size(size)})")
+            yield f"{'would remove' if dry_run else 'remove'} {path} ({readable_size(size)})"
             if not dry_run:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
-    return [*lines, f"{run.work}: {readable_size(total)} {'to free' if dry_run else 'freed'}; export/ is kept"]
+    yield f"{run.work}: {readable_size(total)} {'to free' if dry_run else 'freed'}; export/ is kept"
 
 
 def report_path(case: Case, plans: Mapping[str, StagePlan]) -> tuple[Path, list[str]]:

@@ -8,12 +8,14 @@
     limn clean SUBJECT...    remove intermediate results, keep export/
     limn parameters          every stage's parameters
 
-Exit code 0: done. 1: a stage failed. 2: the input is at fault; then each line on stderr is one fault.
+Exit code 0: all well. 1: a stage failed. 2: the input is at fault; then each line on stderr is one fault. 3: finished,
+but a quality gate of pipeline.yaml is missed: have a look.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
 import webbrowser
@@ -26,8 +28,8 @@ from shared.contract.pipeline import load_pipeline, split_settings
 from shared.contract.subject import MOVES, TRANSFERS
 from shared.contract.wording import unknown_name
 from shared.errors import InputError, LimnError
-from tools.cases import InputErrors, all_parameters, open_cases
-from tools.housekeeping import clean, report_path, status_lines
+from tools.cases import InputErrors, all_parameters, find_subjects, open_cases
+from tools.housekeeping import clean, report_path
 from tools.plan import plan_case, plan_lines
 
 
@@ -75,7 +77,12 @@ def make_parser() -> argparse.ArgumentParser:
     for command in (plan, status):
         command.add_argument("--verify", action="store_true", help="read every published file again")
     run.add_argument("--cores", type=int, metavar="N", help="cores to use (all)")
-    run.add_argument("--profile", metavar="NAME", help="a Snakemake profile, for a cluster")
+    run.add_argument("--memory", type=int, metavar="MB", help="memory for all stages together (nine tenths of what is "
+                     "available)")
+    run.add_argument("--threads", type=int, metavar="N", help="cores of one stage (all; with more subjects, a share)")
+    run.add_argument("--profile", metavar="NAME", help="a Snakemake profile, for a cluster: slurm, generic or a folder")
+    run.add_argument("--summary", type=Path, metavar="FILE", help="where to write summary.json")
+    status.add_argument("--json", action="store_true", help="print it as JSON")
     report.add_argument("--open", action="store_true", help="open it in the browser")
     removal.add_argument("--dry-run", action="store_true", help="only say what would go")
     _add_new(commands)
@@ -88,7 +95,9 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _subject_command(commands: argparse._SubParsersAction, name: str, command, text: str) -> argparse.ArgumentParser:
     parser = commands.add_parser(name, help=text, description=text)
-    parser.add_argument("subjects", nargs="+", type=Path, metavar="SUBJECT", help="folder with subject.yaml")
+    parser.add_argument("subjects", nargs="*", type=Path, metavar="SUBJECT",
+                        help="folder with subject.yaml, or a folder of such")
+    parser.add_argument("--list", type=Path, metavar="FILE", help="a file that names one subject a line")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write to DIR/<subject>/, not to the subject's folder")
     parser.add_argument("--pipeline", type=Path, metavar="FILE", help="another pipeline.yaml")
     parser.add_argument("--trust", type=Path, action="append", default=[], metavar="DIR",
@@ -113,21 +122,31 @@ def _add_new(commands: argparse._SubParsersAction) -> None:
 
 def run_command(args: argparse.Namespace) -> int:
     """limn run"""
-    from tools.workflow import Settings, run_cases
+    from tools.booking import memory_to_give
+    from tools.engine import Settings
+    from tools.gates import check_gates
+    from tools.workflow import default_summary, run_cases
 
     pipeline = load_pipeline(args.pipeline)
     parameters = all_parameters(pipeline, args.preset, args.set)
-    cases = open_cases(args.subjects, args.out)
-    cores = args.cores if args.cores is not None else len(os.sched_getaffinity(0))
-    if cores < 1:
-        raise InputError("number of cores not allowed", where="--cores", got=cores, expected=">= 1")
+    check_gates(pipeline)
+    opened = open_cases(find_subjects(args.subjects, args.list), args.out)
+    cores = args.cores
+    if cores is None and not args.profile:
+        cores = len(os.sched_getaffinity(0))
+    for name, value in (("cores", cores), ("memory", args.memory), ("threads", args.threads)):
+        if value is not None and value < 1:
+            raise InputError(f"{name} not allowed", where=f"--{name}", got=value, expected=">= 1")
+    memory_mb = args.memory or (None if args.profile else memory_to_give())
     given = split_settings(args.set, pipeline.stages)
     preset = [f"--preset={args.preset}"] if args.preset else []
     files = {(name, p.name) for name, stage in pipeline.stages.items() for p in stage.parameters if p.file}
     arguments = {name: preset + [f"--set={key}={parameters[name][key] if (name, key) in files else value}"
                                  for key, value in given.get(name, {}).items()]
                  for name in pipeline.stages}
-    return run_cases(cases, Settings(pipeline, parameters, arguments, args.out, cores, args.profile))
+    return run_cases(opened, Settings(
+        pipeline, parameters, arguments, args.out, cores, memory_mb, args.threads, args.profile,
+        default_summary(args.subjects, args.out, args.summary)))
 
 
 def plan_command(args: argparse.Namespace) -> int:
@@ -137,7 +156,14 @@ def plan_command(args: argparse.Namespace) -> int:
 
 def status_command(args: argparse.Namespace) -> int:
     """limn status"""
-    return _for_each_plan(args, lambda case, plans: print("\n".join(status_lines(case, plans))))
+    from tools.status import status_lines, status_of
+
+    records = []
+    try:
+        return _for_each_plan(args, lambda case, plans: records.append(status_of(case, plans)))
+    finally:
+        lines = [line for record in records for line in status_lines(record)]
+        print(json.dumps(records, indent=1) if args.json else "\n".join(lines), end="\n" if records else "")
 
 
 def report_command(args: argparse.Namespace) -> int:
@@ -156,8 +182,9 @@ def report_command(args: argparse.Namespace) -> int:
 def clean_command(args: argparse.Namespace) -> int:
     """limn clean"""
     pipeline = load_pipeline(args.pipeline)
-    for case in open_cases(args.subjects, args.out):
-        print("\n".join(clean(case.run, pipeline, args.dry_run)))
+    for case in open_cases(find_subjects(args.subjects, args.list), args.out).all():
+        for line in clean(case.run, pipeline, args.dry_run):
+            print(line, flush=True)
     return 0
 
 
@@ -185,10 +212,13 @@ def parameters_command(args: argparse.Namespace) -> int:
 
 
 def _for_each_plan(args: argparse.Namespace, show) -> int:
+    """Shows each subject; those at fault are named in the end."""
     pipeline = load_pipeline(args.pipeline)
     parameters = all_parameters(pipeline, args.preset, args.set)
-    for case in open_cases(args.subjects, args.out):
+    opened = open_cases(find_subjects(args.subjects, args.list), args.out)
+    for case in opened.cases:
         show(case, plan_case(pipeline, case, parameters, getattr(args, "verify", False)))
+    opened.all()
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import time
@@ -12,6 +13,7 @@ from pathlib import Path
 from shared.contract.progress import terminal_bar
 
 _LINE_S = 10.0
+_ENDS = {"current": "current", "done": "done", "input_error": "input error", "failed": "failed"}
 
 
 @dataclass
@@ -27,7 +29,11 @@ class Track:
     message: str = ""
     log: str = ""
     label: str = ""
+    done: int = 0
+    total: int | None = None
+    since: float = 0.0
     bar: object = None
+    bar_label: str = ""
     last_line: float = field(default_factory=time.monotonic)
 
     def new_events(self) -> list[dict]:
@@ -40,7 +46,29 @@ class Track:
             return []
         whole = data[: data.rfind(b"\n") + 1]
         self.read_to += len(whole)
-        return [json.loads(line) for line in whole.splitlines()]
+        events = []
+        for line in whole.splitlines():
+            with contextlib.suppress(ValueError):  # a line that a full disk cut
+                events.append(json.loads(line))
+        return [event for event in events if isinstance(event, dict) and "kind" in event]
+
+    def apply(self, event: dict) -> None:
+        """Takes over what an event says. A stage that starts again (a retry) leaves its earlier end behind."""
+        kind = event["kind"]
+        if kind == "started":
+            self.state, self.message, self.log, self.since = "running", "", "", event["time"]
+            self.label, self.done, self.total = "", 0, None
+        elif kind == "progress":
+            self.label, self.done, self.total = event["label"], event["done"], event["total"]
+        elif kind in _ENDS:
+            self.state, self.message, self.log = _ENDS[kind], event.get("message", ""), event.get("log", "")
+            self.seconds = event.get("seconds", 0.0)
+
+    @property
+    def progress(self) -> str:
+        """How far the running stage is, in words."""
+        whole = f"/{self.total}" if self.total is not None else ""
+        return f"{self.label} {self.done}{whole}" if self.label else "started"
 
 
 class Watch:
@@ -55,6 +83,7 @@ class Watch:
         """Shows what is new."""
         for track in self.tracks:
             for event in track.new_events():
+                track.apply(event)
                 getattr(self, f"_on_{event['kind']}")(track, event)
 
     def close(self) -> None:
@@ -72,36 +101,30 @@ class Watch:
             print(line, file=sys.stderr, flush=True)
 
     def _on_started(self, track: Track, _event: dict) -> None:
-        track.state, track.message = "running", ""
         self._say(track, "started")
 
     def _on_progress(self, track: Track, event: dict) -> None:
-        label, done, total = event["label"], event["done"], event["total"]
         if self._terminal:
-            self._update_bar(track, label, done, total)
+            self._update_bar(track, event["label"], event["done"], event["total"])
         elif time.monotonic() - track.last_line >= _LINE_S:
             track.last_line = time.monotonic()
-            self._say(track, f"{label} {done}" + (f"/{total}" if total is not None else ""))
+            self._say(track, track.progress)
 
     def _on_warning(self, track: Track, event: dict) -> None:
         self._say(track, f"warning: {event['text']}")
 
     def _on_current(self, track: Track, _event: dict) -> None:
-        track.state = "current"
         self._say(track, "current")
 
     def _on_done(self, track: Track, event: dict) -> None:
-        track.state, track.seconds = "done", event["seconds"]
         self._end_bar(track)
         self._say(track, f"done in {track.seconds:.1f} s")
 
     def _on_input_error(self, track: Track, event: dict) -> None:
-        track.state, track.message = "input error", event["message"]
         self._end_bar(track)
         self._say(track, event["message"])
 
     def _on_failed(self, track: Track, event: dict) -> None:
-        track.state, track.message, track.log = "failed", event["message"], event["log"]
         self._end_bar(track)
         self._say(track, f"failed: {event['message']}")
         for line in event["last"]:
@@ -109,10 +132,10 @@ class Watch:
         self._say(track, f"the whole log: {event['log']}")
 
     def _update_bar(self, track: Track, label: str, done: int, total: int | None) -> None:
-        if track.bar is not None and (track.label != label or done < track.bar.n):
+        if track.bar is not None and (track.bar_label != label or done < track.bar.n):
             self._end_bar(track)
         if track.bar is None:
-            track.label = label
+            track.bar_label = label
             track.bar = terminal_bar(None, f"{track.subject}  {track.stage}: {label}", total)
         track.bar.update(done - track.bar.n)
 

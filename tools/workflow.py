@@ -1,69 +1,89 @@
-"""Runs the pipeline on subjects with Snakemake: only what is not current, each stage in its own process.
+"""Runs the pipeline on subjects: only what is not current, each stage in its own process, then says how it went.
 
-Snakemake decides order and parallelism; whether a stage has to run is decided by content (tools/plan.py and the stage
-itself). Each call gets a scratch folder for Snakemake's state, so nothing stale can lock the next one; that no two runs
-work on one subject is held by a lock that the kernel releases with its process.
+Whether a stage has to run is decided by content (tools/plan.py and the stage itself); order and parallelism are the
+engine's. That no two runs work on one subject is held by a lock that the kernel releases with its process.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
-import shlex
 import shutil
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 
 from shared.contract.folders import RunFolder
-from shared.contract.manifest import LOG, PROVENANCE, read_record, write_record
-from shared.contract.pipeline import REPOSITORY, Pipeline
+from shared.contract.manifest import LOG
+from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
-from tools.cases import Case
+from tools.cases import Case, InputErrors, Opened
+from tools.engine import SCRATCH, Settings, configure, run_engine, scratch_folder
+from tools.outcome import Outcome, at_fault, exit_code, outcome_of, write_summary
 from tools.plan import CURRENT, StagePlan, plan_case
+from tools.summary import table_lines
 from tools.watch import Track, Watch
 
-_POLL_S, _DYING_S = 0.2, 2.0
-_SET_PARENT_DEATH_SIGNAL = 1
+_DYING_S = 2.0
 _WORKFLOW_LOG = "workflow.log"
 
 
-@dataclass(frozen=True)
-class Settings:
-    """How to run. parameters: {stage: {parameter: value}}. arguments: what hands them to each stage's command line."""
-
-    pipeline: Pipeline
-    parameters: Mapping[str, Mapping[str, object]]
-    arguments: Mapping[str, Sequence[str]]
-    out: Path | None
-    cores: int
-    profile: str | None = None
-
-
-def run_cases(cases: Sequence[Case], settings: Settings) -> int:
-    """Brings every subject up to date; returns the exit code (2 where only input was at fault)."""
+def run_cases(opened: Opened, settings: Settings) -> int:
+    """Brings every subject up to date, whatever becomes of the others; returns the exit code, see tools/outcome.py."""
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _interrupt)
+    start, started = time.monotonic(), datetime.now(UTC).isoformat(timespec="seconds")
+    faults = list(opened.faults)
     with contextlib.ExitStack() as stack:
-        for case in cases:
-            stack.enter_context(case.run.locked("run"))
-        plans = []
-        for case in cases:
-            clear_leftovers(case.run, settings.pipeline)
-            for path in case.run.work.glob(".workflow-*"):
-                shutil.rmtree(path, ignore_errors=True)
-            plans.append(plan_case(settings.pipeline, case, settings.parameters))
-            _renew_stamps(case.run, plans[-1])
-        waiting = [case for case, plan in zip(cases, plans, strict=True) if not _is_current(plan)]
-        for case in cases:
-            if case not in waiting:
+        planned: list[tuple[Case, dict[str, StagePlan]]] = []
+        for case in opened.cases:
+            try:
+                planned.append((case, _begin(stack, case, settings)))
+            except InputError as error:
+                faults.append((case.subject.folder, error))
+        if not planned:
+            raise InputErrors([error for _, error in faults])
+        for _, error in faults:
+            _say(f"limn: {error}")
+        waiting = [case for case, plan in planned if not is_current(plan)]
+        for case, plan in planned:
+            if is_current(plan):
                 _say(f"{case.name}: current, nothing to do: {case.run.root}")
-        return _run_waiting(waiting, settings) if waiting else 0
+        ended = _run_waiting(waiting, settings, start) if waiting else {}
+        outcomes = [at_fault(folder, error) for folder, error in faults]
+        outcomes += [ended.get(case.name) or outcome_of(case, settings.pipeline, plan) for case, plan in planned]
+    return _finish(outcomes, settings, started, time.monotonic() - start)
+
+
+def _finish(outcomes: Sequence[Outcome], settings: Settings, started: str, seconds: float) -> int:
+    """The table and summary.json; returns the exit code."""
+    if len(outcomes) > 1 or any(outcome.flags for outcome in outcomes):
+        _say("\n".join(table_lines(outcomes)))
+    if settings.summary:
+        write_summary(settings.summary, outcomes, started, seconds)
+        _say(f"summary: {settings.summary}")
+    return exit_code(outcomes)
+
+
+def _begin(stack: contextlib.ExitStack, case: Case, settings: Settings) -> dict[str, StagePlan]:
+    """Locks the subject, clears what killed runs left, plans; InputError where that cannot be."""
+    with contextlib.ExitStack() as own:
+        own.enter_context(case.run.locked("run"))
+        try:
+            clear_leftovers(case.run, settings.pipeline)
+            for path in case.run.work.glob(f"{SCRATCH}*"):
+                shutil.rmtree(path, ignore_errors=True)
+            plan = plan_case(settings.pipeline, case, settings.parameters)
+            _renew_stamps(case.run, plan)
+        except OSError as error:
+            raise InputError("cannot be read or written", where=str(error.filename or case.run.root),
+                             got=error.strerror, mend="check permissions and disk, or write elsewhere with --out DIR"
+                             ) from error
+        stack.push(own.pop_all())
+    return plan
 
 
 def clear_leftovers(run: RunFolder, pipeline: Pipeline, keep_logs: bool = True) -> None:
@@ -90,135 +110,51 @@ def _renew_stamps(run: RunFolder, plans: Mapping[str, StagePlan]) -> None:
             run.stamp(plan.name).unlink(missing_ok=True)
 
 
-def _is_current(plans: Mapping[str, StagePlan]) -> bool:
+def is_current(plans: Mapping[str, StagePlan]) -> bool:
+    """Whether nothing is left to do."""
     return all(plan.state == CURRENT for plan in plans.values())
 
 
-def _run_waiting(cases: Sequence[Case], settings: Settings) -> int:
-    """Calls Snakemake for the subjects that are not current and says how each ended."""
-    start = time.monotonic()
-    with _scratch(cases[0].run) as scratch:
-        tracks = _prepare(scratch, cases, settings)
-        watch = Watch([track for tracks_of_case in tracks for track in tracks_of_case])
+def _run_waiting(cases: Sequence[Case], settings: Settings, start: float) -> dict[str, Outcome]:
+    """Lets the engine work on the subjects that are not current and says how each ended."""
+    with contextlib.ExitStack() as stack:
+        scratches = [stack.enter_context(scratch_folder(case.run)) for case in cases]
+        tracks = configure(scratches, cases, settings)
+        watch, log = Watch([track for own in tracks for track in own]), scratches[0] / _WORKFLOW_LOG
         try:
-            interrupted = not _follow(_snakemake(scratch, settings), scratch / _WORKFLOW_LOG, watch)
+            interrupted = not run_engine(scratches[0], settings, watch, log)
         finally:
             watch.close()
-        if interrupted:
-            for case in cases:
-                clear_leftovers(case.run, settings.pipeline, keep_logs=False)
-        codes = [_conclude(case, own, settings, scratch / _WORKFLOW_LOG, time.monotonic() - start, interrupted)
-                 for case, own in zip(cases, tracks, strict=True)]
-    return 1 if 1 in codes else max(codes)
-
-
-@contextlib.contextmanager
-def _scratch(run: RunFolder) -> Iterator[Path]:
-    """A folder for Snakemake's state and the stages' events, removed in the end."""
-    path = run.work / f".workflow-{os.getpid()}"
-    (path / "events").mkdir(parents=True)
-    (path / "runs").mkdir()
-    try:
-        yield path
-    finally:
-        shutil.rmtree(path, ignore_errors=True)
-
-
-def _prepare(scratch: Path, cases: Sequence[Case], settings: Settings) -> list[list[Track]]:
-    """Writes Snakemake's configuration; returns the event files of each subject's stages."""
-    pipeline, runs, tracks = settings.pipeline, {}, []
-    for i, case in enumerate(cases):
-        (scratch / "runs" / str(i)).symlink_to(case.run.root, target_is_directory=True)
-        events = {name: scratch / "events" / f"{i}-{name}.jsonl" for name in pipeline.steps}
-        runs[str(i)] = {name: _command(name, case, settings, path) for name, path in events.items()}
-        tracks.append([Track(case.name, name, path) for name, path in events.items()])
-    stages = {name: {"needs": list(step.needs), "threads": min(step.threads or settings.cores, settings.cores),
-                     "resources": dict(step.resources)} for name, step in pipeline.steps.items()}
-    write_record(scratch / "config.json", {"runs": runs, "stages": stages})
-    return tracks
-
-
-def _command(name: str, case: Case, settings: Settings, events: Path) -> str:
-    """The shell command of one stage."""
-    pipeline = settings.pipeline
-    command = [sys.executable, "-m", "shared.contract.launch", str(pipeline.root), pipeline.package, name,
-               "--subject", str(case.subject.folder), "--pipeline", str(pipeline.path), "--events", str(events)]
-    if settings.out:
-        command += ["--out", os.path.abspath(settings.out)]
-    return shlex.join([*command, *settings.arguments[name]])
-
-
-def _snakemake(scratch: Path, settings: Settings) -> subprocess.Popen:
-    """Snakemake, started in a process group of its own that dies with this process."""
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(Path(__file__).with_name("Snakefile")),
-               "--directory", str(scratch), "--configfile", str(scratch / "config.json"),
-               "--cores", str(settings.cores), "--keep-going", "--nolock", "--rerun-incomplete",
-               "--rerun-triggers", "mtime", "--nocolor"]
-    if settings.profile:
-        command += ["--profile", settings.profile]
-    search = [str(REPOSITORY), os.environ.get("PYTHONPATH", "")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, search))}
-    with open(scratch / _WORKFLOW_LOG, "wb") as log:
-        return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
-                                env=environment, cwd=scratch, start_new_session=True, preexec_fn=_die_with_parent)
-
-
-def _die_with_parent() -> None:
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
-
-
-def _follow(process: subprocess.Popen, log: Path, watch: Watch) -> bool:
-    """Shows events until Snakemake ends; False where the user interrupted it."""
-    try:
-        while process.poll() is None:
-            watch.poll()
-            time.sleep(_POLL_S)
-        watch.poll()
-        return True
-    except KeyboardInterrupt:
-        return False
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+        for case in cases:
+            clear_leftovers(case.run, settings.pipeline, keep_logs=not interrupted)
+        if not interrupted and all(track.state == "waiting" for track in watch.tracks):
+            for line in log.read_text(encoding="utf-8", errors="replace").splitlines()[-20:]:
+                _say(f"| {line}")
+        return {case.name: _conclude(case, own, settings, log, time.monotonic() - start, interrupted)
+                for case, own in zip(cases, tracks, strict=True)}
 
 
 def _conclude(case: Case, tracks: Sequence[Track], settings: Settings, log: Path, seconds: float,
-              interrupted: bool) -> int:
-    """Says how the subject's run ended, keeps Snakemake's log; returns the subject's exit code."""
-    failed = [track for track in tracks if track.state in ("failed", "input error")]
+              interrupted: bool) -> Outcome:
+    """Keeps the engine's log and says how the subject's run ended."""
     plans = plan_case(settings.pipeline, case, settings.parameters)
-    published = any(case.run.published(name).exists() or case.run.failed(name).exists() for name in plans)
-    if published:
-        shutil.copyfile(log, case.run.work / _WORKFLOW_LOG)
-    if _is_current(plans):
-        _say(f"{case.name}: done in {seconds:.1f} s: {_result(case)}")
-        return 0
+    kept = case.run.work / _WORKFLOW_LOG
+    if any(case.run.published(name).exists() or case.run.failed(name).exists() for name in plans):
+        with contextlib.suppress(OSError):
+            shutil.copyfile(log, kept)
+    outcome = outcome_of(case, settings.pipeline, plans, tracks, interrupted, kept)
     left = [name for name, plan in plans.items() if plan.state != CURRENT]
-    if interrupted:
+    if not left:
+        _say(f"{case.name}: done in {seconds:.1f} s: {_result(case)}")
+    elif outcome.state == "interrupted":
         _say(f"{case.name}: interrupted; limn run again goes on with {left[0]}")
-        return 1
-    if failed:
-        later = [name for name in left if name not in {track.stage for track in failed}]
+    elif outcome.state in ("failed", "input error"):
+        later = [name for name in left if name != outcome.stage]
         _say(f"{case.name}: not done" + (f"; not run: {', '.join(later)}" if later else ""))
-        return 1 if any(track.state == "failed" for track in failed) else 2
-    _conclude_silent(case, tracks, settings.pipeline, log, published)
-    return 1
-
-
-def _conclude_silent(case: Case, tracks: Sequence[Track], pipeline: Pipeline, log: Path, published: bool) -> None:
-    """For a stage that ended without a word (killed, out of memory) or a Snakemake that could not start."""
-    running = [track.stage for track in tracks if track.state == "running"]
-    if not running:
-        for line in log.read_text(encoding="utf-8", errors="replace").splitlines()[-15:]:
-            _say(f"| {line}")
-        _say(f"{case.name}: the workflow engine failed" + (f"; its log: {case.run.work / _WORKFLOW_LOG}" * published))
-        return
-    clear_leftovers(case.run, pipeline)
-    for name in running:
-        _say(f"{case.name}: {name} was killed without a message (out of memory?); its log: "
-             f"{case.run.failed(name) / LOG}; limn run again goes on there")
+    else:
+        _say(f"{case.name}: {outcome.reason}" + (f"; its log: {outcome.log}" if outcome.log else "")
+             + "; limn run again goes on there" * (outcome.state == "killed"))
+    return outcome
 
 
 def _result(case: Case) -> Path:
@@ -228,15 +164,21 @@ def _result(case: Case) -> Path:
     return report if report.is_file() else export if export.is_dir() else case.run.root
 
 
-def seconds_of(run: RunFolder, name: str) -> float | None:
-    """Wall seconds that the published stage took."""
-    provenance = read_record(run.published(name) / PROVENANCE)
-    return provenance.get("wall_s") if provenance else None
-
-
 def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    with contextlib.suppress(BrokenPipeError):
+        print(text, file=sys.stderr, flush=True)
 
 
 def _interrupt(_signal: int, _frame: object) -> None:
     raise KeyboardInterrupt
+
+
+def default_summary(subjects: Sequence[Path], out: Path | None, given: Path | None) -> Path | None:
+    """Where summary.json goes: as told, else to --out, else into the one folder of subjects that was given."""
+    if given is not None:
+        return given
+    if out is not None:
+        return Path(os.path.abspath(out)) / "summary.json"
+    if len(subjects) == 1 and not (subjects[0] / "subject.yaml").exists():
+        return Path(os.path.abspath(subjects[0])) / "summary.json"
+    return None

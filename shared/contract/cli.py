@@ -14,11 +14,13 @@ from pathlib import Path
 
 from shared.contract.currency import reasons_to_run, work_to_do
 from shared.contract.declare import Stage
+from shared.contract.disk import disk_fault
 from shared.contract.execute import execute
 from shared.contract.folders import RunFolder
 from shared.contract.hashing import HashMemory
 from shared.contract.job import Job
-from shared.contract.pipeline import load_pipeline, split_settings
+from shared.contract.needs import amount, measured_scale, scale_of
+from shared.contract.pipeline import Pipeline, load_pipeline, split_settings
 from shared.contract.progress import Reporter
 from shared.contract.subject import Subject, load_subject
 from shared.errors import InputError
@@ -39,6 +41,7 @@ class Request:
     force: bool
     verify: bool
     events: Path | None
+    disk_mb: float | None = None
 
 
 def main(stage: Stage, run: Callable[[Job], None], check: Callable[[Job], None] | None = None,
@@ -54,6 +57,12 @@ def main(stage: Stage, run: Callable[[Job], None], check: Callable[[Job], None] 
                 return 0
             set_threads(request.threads)
             return execute(request, run, check)
+    except OSError as error:
+        fault = disk_fault(error, Path.cwd()) if error.filename is None else disk_fault(error, Path(error.filename))
+        if fault is None:
+            raise
+        report_input_error(stage.name, fault, events)
+        return 2
     except InputError as error:
         report_input_error(stage.name, error, events)
         return 2
@@ -110,12 +119,24 @@ def parse_request(stage: Stage, argv: Sequence[str] | None) -> Request:
     prefix = f"{stage.name}."
     settings = [text if text.startswith(prefix) else prefix + text for text in args.set]
     given = split_settings(settings, [stage.name]).get(stage.name, {})
-    parameters = load_pipeline(args.pipeline).parameters(stage, args.preset, given)
+    pipeline = load_pipeline(args.pipeline)
+    parameters = pipeline.parameters(stage, args.preset, given)
     threads = len(os.sched_getaffinity(0)) if args.threads is None else args.threads
     if threads < 1:
         raise InputError("number of threads not allowed", where="--threads", got=threads, expected=">= 1")
     run = RunFolder.of(subject.folder, subject.name, args.out)
-    return Request(stage, subject, run, parameters, threads, args.force, args.verify, args.events)
+    disk_mb = _disk_needed(pipeline, stage, args.preset, run)
+    return Request(stage, subject, run, parameters, threads, args.force, args.verify, args.events, disk_mb)
+
+
+def _disk_needed(pipeline: Pipeline, stage: Stage, preset: str | None, run: RunFolder) -> float | None:
+    """MB that the stage is expected to write, with a tenth on top; None where pipeline.yaml does not say."""
+    step = pipeline.steps.get(stage.name)
+    if step is None or "disk_mb" not in step.resources:
+        return None
+    parameters = {name: pipeline.parameters(other, preset, {}) for name, other in pipeline.stages.items()}
+    expected = scale_of(pipeline.sizes, pipeline.stages, parameters, str(pipeline.path))
+    return 1.1 * amount(step.resources, "disk_mb", measured_scale(run.root, expected))
 
 
 def set_threads(count: int) -> None:

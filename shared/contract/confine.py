@@ -1,8 +1,8 @@
 """Keeps what a subject or a pipeline names where it belongs: in its own folder.
 
-Both come from strangers. A path in them must stay inside the folder, and a symbolic link must not lead out of it, unless
-it leads into a folder for which the operator vouches: `LIMN_TRUST=/archive:/lab`, or `--trust DIR`. Stages other than
-the repository's are code, so they too are loaded only from such a folder.
+Both come from strangers. A path in them must stay inside the folder, and a symbolic link must not lead out of it,
+unless it leads into a folder for which the operator vouches: `LIMN_TRUST=/archive:/lab`, or `--trust DIR`. Stages other
+than the repository's are code, so they too are loaded only from such a folder.
 """
 
 from __future__ import annotations

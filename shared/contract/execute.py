@@ -5,13 +5,13 @@ from __future__ import annotations
 import shutil
 import signal
 import sys
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
 from shared.contract.currency import input_hashes, work_to_do
+from shared.contract.disk import check_space, disk_fault
 from shared.contract.hashing import HashMemory
 from shared.contract.job import Job
 from shared.contract.manifest import LOG, MANIFEST, PROVENANCE, Work, output_entries, write_record
@@ -24,18 +24,27 @@ from shared.errors import InputError, LimnError
 if TYPE_CHECKING:
     from shared.contract.cli import Request
 
-_LAST_LINES = 12
+_LAST_LINES = 20
 
 
 def execute(request: Request, run: Callable[[Job], None], check: Callable[[Job], None] | None) -> int:
-    """0 when the folder is published; 1 when the stage failed, its log is kept then. InputError leaves nothing."""
+    """0 when the folder is published; 1 when the stage failed, its log is kept then. InputError leaves nothing.
+
+    All that the stage will read is read once before, so that a bit that flipped on the disk is noticed.
+    """
     signal.signal(signal.SIGTERM, _interrupt)
     name, folders = request.stage.name, request.run
-    memory = HashMemory(folders.memory, request.verify)
-    work = work_to_do(request.stage, request.subject, folders, request.parameters, memory)
-    temporary = folders.temporary(name)
-    reporter = Reporter(name, temporary / LOG, request.events)
+    memory = HashMemory(folders.memory, verify=True)
     try:
+        work = work_to_do(request.stage, request.subject, folders, request.parameters, memory)
+    except InputError:
+        memory.save()  # so that the next plan knows of the damage, too
+        raise
+    check_space(folders.work, request.disk_mb)
+    temporary = folders.temporary(name)
+    reporter = Reporter(name, None, request.events)
+    try:
+        reporter = Reporter(name, temporary / LOG, request.events)
         reporter.event("started")
         seconds = _do(request, work, run, check, temporary, reporter, memory)
     except InputError:
@@ -48,6 +57,10 @@ def execute(request: Request, run: Callable[[Job], None], check: Callable[[Job],
         sys.stderr.write(f"{name}: interrupted\n")
         return 1
     except Exception as error:
+        if (fault := disk_fault(error, folders.work)) is not None:
+            reporter.close()
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise fault from error
         return _failed(request, temporary, reporter, error)
     reporter.event("done", seconds=seconds)
     if not request.events:
@@ -92,7 +105,7 @@ def _do(request: Request, work: Work, run: Callable[[Job], None], check: Callabl
 def _failed(request: Request, temporary: Path, reporter: Reporter, error: Exception) -> int:
     """Keeps the log with the trace and says where it is."""
     name = request.stage.name
-    reporter.write_log(traceback.format_exc())
+    reporter.write_trace()
     reporter.close()
     log = request.run.keep_failed(temporary, name)
     message = " ".join(str(error).split()) or "no message"

@@ -85,7 +85,8 @@ class RunFolder:
         shutil.rmtree(failed, ignore_errors=True)
         failed.mkdir(parents=True)
         log = failed / LOG
-        (temporary / LOG).rename(log)
+        with contextlib.suppress(FileNotFoundError):
+            (temporary / LOG).rename(log)
         shutil.rmtree(temporary, ignore_errors=True)
         return log
 
@@ -97,6 +98,10 @@ class RunFolder:
         """Removes what killed processes left of the stage."""
         for path in self.leftovers(name):
             shutil.rmtree(path, ignore_errors=True)
+
+    def is_locked(self, name: str) -> bool:
+        """Whether another living process holds the lock now."""
+        return _is_held(self.work / f".{name}.lock")
 
     @contextlib.contextmanager
     def locked(self, name: str, wait_s: float = 0.0) -> Iterator[None]:
@@ -116,6 +121,21 @@ class RunFolder:
             with contextlib.suppress(OSError):
                 for folder in (self.work, self.root, *added):
                     folder.rmdir()
+
+
+def _is_held(path: Path) -> bool:
+    """Whether a living process holds the lock file."""
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except OSError:
+        return False
+    try:
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(file)
+    return False
 
 
 def _acquire(path: Path, deadline: float) -> int:
@@ -142,8 +162,9 @@ def _acquire(path: Path, deadline: float) -> int:
             time.sleep(0.05)
             continue
         if _is_same_file(path, file):
-            os.ftruncate(file, 0)
-            os.write(file, f"{os.getpid()}\n".encode())
+            with contextlib.suppress(OSError):  # a full disk; who holds the lock is for people only
+                os.ftruncate(file, 0)
+                os.write(file, f"{os.getpid()}\n".encode())
             return file
         os.close(file)
 

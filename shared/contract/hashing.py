@@ -33,8 +33,8 @@ def hash_file(path: Path) -> str:
 class HashMemory:
     """SHA-256 of files under one folder and of the source, kept in `path` between calls.
 
-    It only saves time: an entry counts while the file's size and time of change are the recorded ones, and a memory
-    that is lost or damaged is built again.
+    It only saves time: an entry counts while the file's size and times of change are the recorded ones (the inode's
+    too, which nobody can set back), and a memory that is lost or damaged is built again.
     """
 
     def __init__(self, path: Path, verify: bool = False) -> None:
@@ -47,19 +47,17 @@ class HashMemory:
 
     def hash(self, path: Path) -> str:
         """SHA-256 of the file's content."""
-        stat = path.stat()
-        key, state = self._key(path), [stat.st_size, stat.st_mtime_ns]
+        key, state = self._key(path), _state(path)
         known = self._known.get(key)
-        if not self.verify and isinstance(known, list) and len(known) == 3 and known[:2] == state:
-            return known[2]
+        if not self.verify and isinstance(known, list) and known[:-1] == state:
+            return known[-1]
         digest = hash_file(path)
         self._known[key], self._changed = [*state, digest], True
         return digest
 
     def learn(self, path: Path, digest: str) -> None:
         """Remembers a hash that was computed elsewhere."""
-        stat = path.stat()
-        self._known[self._key(path)], self._changed = [stat.st_size, stat.st_mtime_ns, digest], True
+        self._known[self._key(path)], self._changed = [*_state(path), digest], True
 
     def save(self) -> None:
         """Writes what was learnt, where the folder exists and can be written."""
@@ -72,3 +70,8 @@ class HashMemory:
 
     def _key(self, path: Path) -> str:
         return os.path.relpath(path, self.path.parent)
+
+
+def _state(path: Path) -> list[int]:
+    stat = path.stat()
+    return [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]

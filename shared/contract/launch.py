@@ -7,6 +7,7 @@ result is current, without loading what the stage needs; else becomes `python -m
 from __future__ import annotations
 
 import ctypes
+import json
 import os
 import signal
 import sys
@@ -31,6 +32,17 @@ def tie_to_parent() -> None:
         raise SystemExit(1)
 
 
+def earlier_verdict(events: Path | None) -> int | None:
+    """The exit code of an earlier attempt that ended by itself: the same work would end the same way again.
+
+    None on the first attempt, and where the earlier one was killed (out of memory, out of time, its node lost).
+    """
+    if events is None or int(os.environ.get("LIMN_ATTEMPT", "1")) < 2 or not events.is_file():
+        return None
+    kinds = [json.loads(line)["kind"] for line in events.read_text(encoding="utf-8").splitlines()]
+    return {"input_error": 2, "failed": 1}.get(kinds[-1]) if kinds else None
+
+
 def main() -> int:
     """0 where the stage is current, 2 where the input is at fault; otherwise it does not return."""
     tie_to_parent()
@@ -41,6 +53,8 @@ def main() -> int:
     except InputError as error:
         report_input_error(name, error, None)
         return 2
+    if (code := earlier_verdict(request.events)) is not None:
+        return code
     try:
         if answer_current(request):
             return 0

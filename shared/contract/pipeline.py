@@ -11,6 +11,7 @@ from pathlib import Path
 
 from shared.contract.confine import is_trusted
 from shared.contract.declare import Parameter, Stage
+from shared.contract.needs import parse_needs, parse_sizes
 from shared.contract.source import read_declaration
 from shared.contract.wording import check_keys, nearest, read_yaml, unknown_name
 from shared.errors import InputError, shown
@@ -19,17 +20,38 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 DEFAULT_PIPELINE = REPOSITORY / "pipeline.yaml"
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,63}\Z")
 _THREADS = Parameter("threads", int, None, "Cores of one job.", "cores", 1, 4096)
-_RESOURCE = Parameter("resource", int, 1, "What a cluster books for one job.", "", 1)
+_LIMIT = Parameter("limit", float, None, "Threshold of a quality gate.", "", -1e9, 1e9)
 
 
 @dataclass(frozen=True)
 class Step:
-    """A stage as pipeline.yaml places it. threads: None for all cores. resources: mem_mb, runtime (minutes)."""
+    """A stage as pipeline.yaml places it. threads: None for all cores. resources: {kind: {term: coefficient}}, see
+    needs.py.
+    """
 
     needs: tuple[str, ...]
     threads: int | None = None
-    resources: Mapping[str, int] = field(default_factory=dict)
+    resources: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     parameters: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Gate:
+    """What a good result keeps to, inclusive."""
+
+    least: float | None = None
+    most: float | None = None
+
+    def holds(self, value: float) -> bool:
+        """Whether a measured value is good enough; what is no number is not."""
+        low = self.least is None or value >= self.least
+        return low and (self.most is None or value <= self.most) and value == value
+
+    @property
+    def limit(self) -> str:
+        """The limits in words."""
+        ends = ((self.least, "more"), (self.most, "less"))
+        return " and ".join(f"{limit:g} or {word}" for limit, word in ends if limit is not None)
 
 
 @dataclass(frozen=True)
@@ -41,6 +63,8 @@ class Pipeline:
     steps: Mapping[str, Step]
     presets: Mapping[str, Mapping[str, Mapping[str, object]]]
     default_preset: str
+    sizes: Mapping[str, str] = field(default_factory=dict)
+    gates: Mapping[str, Gate] = field(default_factory=dict)
 
     @cached_property
     def root(self) -> Path:
@@ -106,7 +130,8 @@ def load_pipeline(path: Path | None = None) -> Pipeline:
     path = Path(path).absolute() if path else DEFAULT_PIPELINE
     if not path.is_file():
         raise InputError("no such file", where=str(path), mend="give the pipeline with --pipeline FILE")
-    content = check_keys(read_yaml(path), ("package", "stages", "presets", "default_preset"), str(path))
+    known = ("package", "stages", "presets", "default_preset", "sizes", "gates")
+    content = check_keys(read_yaml(path), known, str(path))
     given = check_keys(content.get("stages"), _Anything(), f"{path}: stages")
     for name in given:
         if not _is_name(name):
@@ -126,7 +151,17 @@ def load_pipeline(path: Path | None = None) -> Pipeline:
     presets = presets or {default: {}}
     if default not in presets:
         raise unknown_name("preset", default, presets, f"{path}: default_preset")
-    return Pipeline(path, package, steps, presets, default)
+    gates = check_keys(content.get("gates"), _Anything(), f"{path}: gates")
+    gates = {str(name): _gate(value, f"{path}: gates.{shown(name)}") for name, value in gates.items()}
+    return Pipeline(path, package, steps, presets, default, parse_sizes(content.get("sizes"), f"{path}: sizes"), gates)
+
+
+def _gate(value: object, where: str) -> Gate:
+    given = check_keys(value, ("least", "most"), where)
+    limits = {name: _LIMIT.parse(limit, f"{where}.{name}") for name, limit in given.items()}
+    if not any(limit is not None for limit in limits.values()):
+        raise InputError("a gate without limits", where=where, mend="give least: or most:")
+    return Gate(**limits)
 
 
 def _is_name(value: object) -> bool:
@@ -145,8 +180,7 @@ def _step(value: object, where: str) -> Step:
     needs = given.get("needs") or []
     if not isinstance(needs, list):
         raise InputError("not a list of stages", where=f"{where}.needs", got=shown(needs))
-    resources = check_keys(given.get("resources"), ("mem_mb", "runtime", "disk_mb"), f"{where}.resources")
-    booked = {name: _RESOURCE.parse(amount, f"{where}.resources.{name}") for name, amount in resources.items()}
+    booked = parse_needs(given.get("resources"), f"{where}.resources")
     threads = _THREADS.parse(given.get("threads"), f"{where}.threads")
     parameters = check_keys(given.get("parameters"), _Anything(), f"{where}.parameters")
     return Step(tuple(map(str, needs)), threads, booked, parameters)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import sys
 import time
+import traceback
 from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -28,18 +31,22 @@ def terminal_bar(items: Iterable[Item] | None, label: str, total: int | None) ->
 
 
 class Reporter:
-    """Log, terminal and events of one stage. Under the workflow (events given) the terminal is the workflow's."""
+    """Log, terminal and events of one stage. Under the workflow (events given) the terminal is the workflow's.
+
+    Every line of a log has one form: `2026-11-21T14:03:08Z     12.3 s  info     text`, levels info, warning and error.
+    """
 
     def __init__(self, stage: str, log: Path | None, events: Path | None = None) -> None:
         self.stage, self.events = stage, events
         self.warnings: list[str] = []
-        self._log = open(log, "w", encoding="utf-8", buffering=1) if log else None  # noqa: SIM115
+        self._log = open(log, "w", encoding="utf-8", errors="backslashreplace", buffering=1) if log else None  # noqa: SIM115
         self._start = time.perf_counter()
 
     def close(self) -> None:
         """Closes the log."""
         if self._log:
-            self._log.close()
+            with contextlib.suppress(OSError):
+                self._log.close()
             self._log = None
 
     def note(self, text: str) -> None:
@@ -53,22 +60,29 @@ class Reporter:
         if text in self.warnings:
             return
         self.warnings.append(text)
-        self.write_log(f"warning: {text}")
+        self.write_log(text, "warning")
         self.event("warning", text=text)
         if not self.events:
             self._say(f"{self.stage}: warning: {text}")
 
-    def write_log(self, text: str) -> None:
-        """Lines into log.txt, with the seconds since the start."""
-        if self._log:
+    def write_log(self, text: str, level: str = "info") -> None:
+        """Lines into log.txt, each with the time, the seconds since the start and its level."""
+        if not self._log:
+            return
+        now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        with contextlib.suppress(OSError):
             for line in text.splitlines() or [""]:
-                self._log.write(f"[{time.perf_counter() - self._start:8.1f} s] {line}\n")
+                self._log.write(f"{now} {time.perf_counter() - self._start:8.1f} s  {level:7}  {line}\n")
+
+    def write_trace(self) -> None:
+        """The exception that is being handled, into the log."""
+        self.write_log(traceback.format_exc(), "error")
 
     def event(self, kind: str, **content: object) -> None:
         """One line of JSON for the workflow, which reads along."""
         if self.events:
-            with open(self.events, "a", encoding="utf-8") as file:
-                file.write(json.dumps({"kind": kind, **content}) + "\n")
+            with contextlib.suppress(OSError), open(self.events, "a", encoding="utf-8") as file:
+                file.write(json.dumps({"kind": kind, "time": round(time.time(), 1), **content}) + "\n")
 
     def track(self, items: Iterable[Item], label: str, total: int | None = None) -> Iterator[Item]:
         """Hands on the items and shows how many are done."""

@@ -1,0 +1,138 @@
+"""Image sequences."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import OpenEXR
+
+from bad_inputs.cases import case, write_settings
+from bad_inputs.clips import head
+from shared.color import decode_srgb
+from shared.io.images import write_png
+
+LINEAR = "colour: {transfer: linear}\n"
+
+
+def sequence(folder, suffix, write, more="", count=12):
+    """frames/%04d.<suffix> by write(path, codes, number)."""
+    (folder / "frames").mkdir()
+    for number, codes in enumerate(head()[:count]):
+        write(folder / "frames" / f"{number:04d}.{suffix}", codes, number)
+    write_settings(folder, f"frames/%04d.{suffix}", more)
+
+
+def exr(path, channels):
+    """Any channels, as they are."""
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    with OpenEXR.File(header, {name: np.ascontiguousarray(values) for name, values in channels.items()}) as file:
+        file.write(str(path))
+
+
+def linear(codes):
+    """[H, W, 3] float32."""
+    return decode_srgb(codes / 255.0).astype(np.float32)
+
+
+def spoilt_exr(where, value):
+    """Writes the frames of these numbers with one value that is no number."""
+    def write(path, codes, number):
+        values = linear(codes)
+        if number in where:
+            values[3, 4, 1] = value
+        exr(path, {"RGB": values})
+    return write
+
+
+@case("linear EXR")
+def linear_exr(folder):
+    sequence(folder, "exr", spoilt_exr((), 0), LINEAR)
+
+
+@case("NaN in an EXR")
+def nan_exr(folder):
+    sequence(folder, "exr", spoilt_exr((5, 6), np.nan), LINEAR)
+
+
+@case("NaN in the first EXR", "NaN")
+def nan_first(folder):
+    sequence(folder, "exr", spoilt_exr((0,), np.nan), LINEAR)
+
+
+@case("Inf in every EXR", "NaN or infinite")
+def inf_exr(folder):
+    sequence(folder, "exr", spoilt_exr(range(12), np.inf), LINEAR)
+
+
+@case("a huge EXR", "too large|not a readable")
+def huge_exr(folder):
+    def write(path, codes, number):
+        exr(path, {"RGB": linear(codes)})
+        data = bytearray(path.read_bytes())
+        for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
+            struct.pack_into("<4i", data, data.index(name) + len(name) + 4, 0, 0, 59_999, 59_999)
+        path.write_bytes(data)
+    sequence(folder, "exr", write, LINEAR)
+
+
+@case("a truncated EXR", "truncated|not a readable")
+def truncated_exr(folder):
+    def write(path, codes, number):
+        exr(path, {"RGB": linear(codes)})
+        path.write_bytes(path.read_bytes()[:600])
+    sequence(folder, "exr", write, LINEAR)
+
+
+@case("EXR of other channels", "other channels")
+def other_channels(folder):
+    depth = np.zeros((144, 144), np.float32)
+    sequence(folder, "exr", lambda path, codes, _: exr(path, {"depth.Z": depth, "id": depth}), LINEAR)
+
+
+@case("16 bit PNG")
+def deep_png(folder):
+    sequence(folder, "png", lambda path, codes, _: write_png(path, codes.astype(np.uint16) * 257))
+
+
+@case("grey PNG with alpha")
+def grey_alpha(folder):
+    def write(path, codes, number):
+        cv2.imwrite(str(path), np.dstack([codes[..., 1]] * 3 + [codes[..., 0]]))
+    sequence(folder, "png", write)
+
+
+@case("a PNG bomb", "too large|unusable")
+def png_bomb(folder):
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    def write(path, codes, number):
+        rows = zlib.compress(bytes(30_000 * (1 + 30_000 // 8)), 9)
+        header = chunk(b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 1, 0, 0, 0, 0))
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", rows) + chunk(b"IEND", b""))
+    sequence(folder, "png", write, count=3)
+
+
+@case("a gap in the numbers")
+def gap(folder):
+    sequence(folder, "png", lambda path, codes, number: write_png(path.with_name(f"{5 * number:04d}.png"), codes))
+
+
+@case("images of two sizes")
+def two_sizes(folder):
+    def write(path, codes, number):
+        write_png(path, cv2.resize(codes, (100, 100)) if number % 4 == 3 else codes)
+    sequence(folder, "png", write)
+
+
+@case("an empty image", "the file is empty", "limn")
+def empty_image(folder):
+    sequence(folder, "png", lambda path, codes, n: path.touch() if n == 7 else write_png(path, codes))
+
+
+@case("text as images", "first image")
+def text_images(folder):
+    sequence(folder, "png", lambda path, codes, n: path.write_text("not an image"))

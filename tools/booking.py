@@ -1,0 +1,34 @@
+"""What the jobs of a run book: memory and minutes by the work's real size, and what this machine has to give."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+from pathlib import Path
+
+from shared.contract.needs import Scale, amount, measured_scale
+
+KINDS = ("mem_mb", "runtime")
+KEPT_FREE = 0.1
+_CGROUP = Path("/sys/fs/cgroup")
+
+
+def booked(needs: Mapping[str, Mapping[str, float]], kind: str, scale: Mapping[str, float], run: Path, attempt: int,
+           limit: int | None) -> int:
+    """Megabytes or minutes of one job. run: the folder that holds work/. attempt: 1, 2 ..: as many times the amount.
+
+    limit: no more than that, since a job that asks for more than there is would wait for ever.
+    """
+    needed = attempt * amount(needs, kind, measured_scale(run, Scale(**scale)))
+    return needed if limit is None else min(needed, limit)
+
+
+def memory_to_give() -> int:
+    """MB that the jobs may take together: what is available now, within the control group's limit, less a tenth."""
+    import psutil
+
+    available = psutil.virtual_memory().available
+    with contextlib.suppress(OSError, ValueError):
+        limit = int((_CGROUP / "memory.max").read_text())
+        available = min(available, limit - int((_CGROUP / "memory.current").read_text()))
+    return max(1, int(available * (1 - KEPT_FREE) / 2**20))

@@ -1,0 +1,121 @@
+"""Quality gates: whether a finished subject is good enough to be handed on unseen, and the picture that shows why not.
+
+pipeline.yaml sets the thresholds. A subject that misses one is finished all the same, and flagged `review`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from shared.contract.folders import RunFolder
+from shared.contract.manifest import outputs_digest, read_manifest, read_record, write_record
+from shared.contract.pipeline import Gate, Pipeline
+from shared.contract.wording import unknown_name
+
+if TYPE_CHECKING:
+    import numpy as np
+
+RECORD, PICTURE = "quality.json", "review.png"
+DETERMINED = 0.5
+"""Confidence from which a texel counts as determined by the clip."""
+
+
+@dataclass(frozen=True)
+class Flag:
+    """A gate that was missed."""
+
+    gate: str
+    value: float
+    limit: str
+
+    def __str__(self) -> str:
+        return f"{self.gate} {self.value:.3g} (expected {self.limit})"
+
+
+def reprojection_px(run: RunFolder) -> float | None:
+    """Median distance of the tracked skin points from where the solved poses put them, px of the crop."""
+    record = read_record(run.published("track_landmarks") / "tracking.json") or {}
+    return _number(record.get("reprojection_px", {}), "median")
+
+
+def held_out_residual(run: RunFolder) -> float | None:
+    """Mean absolute difference of re-renders from frames that were not fitted; 1 is the clip's white."""
+    record = read_record(run.published("inverse_render") / "solve.json") or {}
+    return _number(record.get("residuals", {}), "held_out")
+
+
+def coverage(run: RunFolder) -> float | None:
+    """Share of the map's seen texels that the clip determines well (confidence above 0.5)."""
+    seen = _seen(run)
+    return None if seen is None or not seen.size else float((seen > DETERMINED).mean())
+
+
+def confidence(run: RunFolder) -> float | None:
+    """Median confidence of the texels that are seen at all."""
+    import numpy as np
+
+    seen = _seen(run)
+    return None if seen is None or not seen.size else float(np.median(seen))
+
+
+MEASURES: Mapping[str, Callable[[RunFolder], float | None]] = {
+    measure.__name__: measure for measure in (reprojection_px, held_out_residual, coverage, confidence)}
+
+
+def check_gates(pipeline: Pipeline) -> None:
+    """InputError for a gate that nobody can measure."""
+    for name in pipeline.gates:
+        if name not in MEASURES:
+            raise unknown_name("gate", name, MEASURES, f"{pipeline.path}: gates")
+
+
+def judge(run: RunFolder, pipeline: Pipeline) -> list[Flag]:
+    """The gates that a finished result misses; the verdict is kept beside the result, a picture where it is bad."""
+    if not pipeline.gates:
+        return []
+    asked = {name: asdict(gate) for name, gate in pipeline.gates.items()}
+    results = {name: outputs_digest(manifest) for name in pipeline.steps
+               if (manifest := read_manifest(run.published(name))) is not None}
+    before = read_record(run.work / RECORD)
+    if before and before.get("gates") == asked and before.get("results") == results:
+        return [Flag(**flag) for flag in before["flags"]]
+    values = {name: MEASURES[name](run) for name in pipeline.gates}
+    flags = [Flag(name, value, pipeline.gates[name].limit) for name, value in values.items()
+             if value is not None and not pipeline.gates[name].holds(value)]
+    if flags:
+        from tools.review_picture import write_review
+
+        write_review(run, [flag.gate for flag in flags], [str(flag) for flag in flags])
+    else:
+        (run.work / PICTURE).unlink(missing_ok=True)
+    write_record(run.work / RECORD, {"gates": asked, "results": results, "values": values,
+                                     "flags": [asdict(flag) for flag in flags]})
+    return flags
+
+
+def limits_of(gates: Mapping[str, Gate]) -> str:
+    """All thresholds in words."""
+    return ", ".join(f"{name} {gate.limit}" for name, gate in gates.items())
+
+
+def confidence_map(run: RunFolder) -> Path:
+    """The exported map that coverage and confidence are measured on."""
+    return run.root / "export" / "maps" / "confidence.exr"
+
+
+def _seen(run: RunFolder) -> np.ndarray | None:
+    path = confidence_map(run)
+    if not path.is_file():
+        return None
+    from shared.io.images import read_exr
+
+    values = read_exr(path)
+    return values[values > 0]
+
+
+def _number(record: object, name: str) -> float | None:
+    value = record.get(name) if isinstance(record, dict) else None
+    return float(value) if isinstance(value, int | float) else None

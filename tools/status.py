@@ -1,0 +1,67 @@
+"""`limn status`: where each stage of each subject stands, while a run works on it, too."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+
+from shared.contract.manifest import PROVENANCE, read_record
+from tools.cases import Case
+from tools.engine import EVENTS, SCRATCH
+from tools.gates import RECORD, Flag
+from tools.housekeeping import folder_size, readable_size
+from tools.plan import CURRENT, StagePlan
+from tools.watch import Track
+
+HEADER = f"  {'stage':16} {'state':9} {'size':>10} {'seconds':>8} {'peak':>9}  {'started':25}  folder"
+
+
+def status_of(case: Case, plans: Mapping[str, StagePlan]) -> dict[str, object]:
+    """One subject as a record: its stages with state, cost, size and, of those that run now, progress."""
+    live = {track.stage: track for track in running_stages(case)}
+    stages = []
+    for name, plan in plans.items():
+        folder, track = case.run.published(name), live.get(name)
+        provenance = read_record(folder / PROVENANCE) or {}
+        failed = case.run.failed(name) / "log.txt"
+        stages.append({
+            "stage": name, "state": "running" if track else plan.state, "reasons": list(plan.reasons),
+            "bytes": folder_size(folder) if folder.is_dir() else None, "seconds": provenance.get("wall_s"),
+            "peak_memory_mb": provenance.get("peak_memory_mb"), "started": provenance.get("started"),
+            "folder": str(folder.relative_to(case.run.root)) if folder.is_dir() else None,
+            "progress": track.progress if track else "",
+            "running_s": round(time.time() - track.since, 1) if track else None,
+            "failed_log": str(failed) if failed.is_file() else "",
+        })
+    flags = [str(Flag(**flag)) for flag in (read_record(case.run.work / RECORD) or {}).get("flags", ())]
+    current = all(plan.state == CURRENT for plan in plans.values())
+    return {"subject": case.name, "folder": str(case.subject.folder), "results": str(case.run.root),
+            "running": case.run.is_locked("run"), "flags": flags if current else [], "stages": stages}
+
+
+def running_stages(case: Case) -> Iterator[Track]:
+    """The stages at work, as their events tell; none where no living process holds the subject."""
+    if not case.run.is_locked("run"):
+        return
+    for path in sorted(case.run.work.glob(f"{SCRATCH}*/{EVENTS}/*.jsonl")):
+        track = Track(case.name, path.stem, path)
+        for event in track.new_events():
+            track.apply(event)
+        if track.state == "running":
+            yield track
+
+
+def status_lines(record: Mapping) -> list[str]:
+    """The record for people."""
+    lines = [f"{record['subject']}: {record['results']}" + "; a run works on it" * record["running"], HEADER]
+    for stage in record["stages"]:
+        size = readable_size(stage["bytes"]) if stage["bytes"] is not None else "-"
+        seconds = f"{stage['seconds']:.1f}" if stage["seconds"] is not None else "-"
+        peak = f"{stage['peak_memory_mb']:.0f} MB" if stage["peak_memory_mb"] is not None else "-"
+        lines.append(f"  {stage['stage']:16} {stage['state']:9} {size:>10} {seconds:>8} {peak:>9}  "
+                     f"{stage['started'] or '-':25}  {stage['folder'] or '-'}")
+        if stage["progress"]:
+            lines.append(f"  {'':16} since {stage['running_s']:.0f} s: {stage['progress']}")
+        if stage["failed_log"]:
+            lines.append(f"  {'':16} failed: {stage['failed_log']}")
+    return lines + [f"  review: {flag}" for flag in record["flags"]]
