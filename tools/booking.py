@@ -14,12 +14,12 @@ _CGROUP = Path("/sys/fs/cgroup")
 
 
 def booked(needs: Mapping[str, Mapping[str, float]], kind: str, scale: Mapping[str, float], run: Path, attempt: int,
-           limit: int | None) -> int:
+           limit: int | None = None, overhead: int = 0) -> int:
     """Megabytes or minutes of one job. run: the folder that holds work/. attempt: 1, 2 ..: as many times the amount.
 
-    limit: no more than that, since a job that asks for more than there is would wait for ever.
+    limit: no more than that, since a job that asks for more than there is would wait for ever. overhead: added once.
     """
-    needed = attempt * amount(needs, kind, measured_scale(run, Scale(**scale)))
+    needed = attempt * amount(needs, kind, measured_scale(run, Scale(**scale))) + overhead
     return needed if limit is None else min(needed, limit)
 
 

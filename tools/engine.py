@@ -32,6 +32,8 @@ EVENTS = "events"
 _POLL_S, _TRACKS_PER_S = 0.2, 1000
 _SET_PARENT_DEATH_SIGNAL = 1
 _CLUSTER_THREADS = 4
+_CLUSTER_MB = 400
+"""What the engine itself takes inside each job of a cluster."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,8 @@ def configure(scratches: Sequence[Path], cases: Sequence[Case], settings: Settin
               for name, step in pipeline.steps.items()}
     scale = asdict(scale_of(pipeline.sizes, pipeline.stages, settings.parameters, str(pipeline.path)))
     write_record(home / "config.json",
-                 {"runs": runs, "stages": stages, "scale": scale, "memory_mb": settings.memory_mb})
+                 {"runs": runs, "stages": stages, "scale": scale, "memory_mb": settings.memory_mb,
+                  "overhead_mb": _CLUSTER_MB if settings.profile else 0})
     return tracks
 
 
@@ -150,5 +153,6 @@ def _cancel_jobs(process: subprocess.Popen) -> None:
 
 
 def _die_with_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background job would hand on that it is ignored
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)

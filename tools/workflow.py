@@ -150,7 +150,9 @@ def _conclude(case: Case, tracks: Sequence[Track], settings: Settings, log: Path
         _say(f"{case.name}: interrupted; limn run again goes on with {left[0]}")
     elif outcome.state in ("failed", "input error"):
         later = [name for name in left if name != outcome.stage]
-        _say(f"{case.name}: not done" + (f"; not run: {', '.join(later)}" if later else ""))
+        told = any(track.state == outcome.state for track in tracks)
+        _say(f"{case.name}: not done" + f": {outcome.reason}" * (not told)
+             + (f"; not run: {', '.join(later)}" if later else ""))
     else:
         _say(f"{case.name}: {outcome.reason}" + (f"; its log: {outcome.log}" if outcome.log else "")
              + "; limn run again goes on there" * (outcome.state == "killed"))

@@ -69,9 +69,9 @@ def with_object(path):
 
 
 def zip_bomb(path):
-    """Ten gigabytes of zeros in ten megabytes."""
+    """Two gigabytes of zeros in two megabytes."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file, file.open("landmarks_px.npy", "w") as member:
-        for _ in range(1000):
+        for _ in range(200):
             member.write(bytes(10_000_000))
 
 

@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import re
+import resource
 import subprocess
 import sys
 import tempfile
@@ -42,11 +43,12 @@ def main() -> int:
             record = measure(CASES[name], Path(scratch))
         records.append(record)
         state = "; ".join(record["faults"]) or "ok"
-        print(f"{name:42} exit {record['code']}  {record['seconds']:5.1f} s  {record['peak_mb']:5.0f} MB  {state}  "
-              f"{record['line'][:160]}", flush=True)
+        print(f"{name:42} exit {record['code']}  {record['seconds']:5.1f} s  cpu {record['cpu_s']:5.1f} s  "
+              f"{record['peak_mb']:5.0f} MB  {state}  {record['line'][:160]}", flush=True)
     wrong = [record["name"] for record in records if record["faults"]]
     print(f"{len(records)} cases, {sum(r['code'] == 0 for r in records)} with a result, {len(wrong)} wrong: {wrong}; "
-          f"longest {max(r['seconds'] for r in records):.1f} s, largest {max(r['peak_mb'] for r in records):.0f} MB")
+          f"longest {max(r['seconds'] for r in records):.1f} s ({max(r['cpu_s'] for r in records):.1f} s of processor "
+          f"time), largest {max(r['peak_mb'] for r in records):.0f} MB")
     if options.json:
         options.json.write_text(json.dumps(records, indent=1) + "\n")
     return 1 if wrong else 0
@@ -65,7 +67,10 @@ def measure(case: Case, scratch: Path) -> dict:
     before = contents(scratch)
     quick = () if "--pipeline" in arguments else QUICK
     command = [sys.executable, "-m", "tools.limn", "run", str(folder), *target, *quick, *arguments, "--cores", "1"]
+    spent = resource.getrusage(resource.RUSAGE_CHILDREN)
     code, output, seconds, peak_mb = run(command)
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_s = used.ru_utime + used.ru_stime - spent.ru_utime - spent.ru_stime
     after = {name: digest for name, digest in contents(scratch).items() if not name.startswith("out/")}
     line = next((text for text in output.splitlines() if re.search(case.words, text)), "") if case.words else ""
     faults = [fault for fault, is_so in {
@@ -80,8 +85,8 @@ def measure(case: Case, scratch: Path) -> dict:
     }.items() if is_so]
     if faults:
         print(output, file=sys.stderr)
-    return {"name": case.name, "code": code, "seconds": round(seconds, 2), "peak_mb": round(peak_mb), "line": line,
-            "faults": faults}
+    return {"name": case.name, "code": code, "seconds": round(seconds, 2), "cpu_s": round(cpu_s, 2),
+            "peak_mb": round(peak_mb), "line": line, "faults": faults}
 
 
 def contents(folder: Path) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""How often each word occurs. `pause_s` makes it slow; the environment variable TOY_FAIL makes it fail."""
+"""How often each word occurs. `pause_s` makes it slow, `hoard_mb` large, the variable TOY_FAIL fail."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ STAGE = Stage(
     parameters=(
         Parameter("least", int, 1, "Fewest occurrences.", "words", 1, 100),
         Parameter("pause_s", float, 0.0, "Pause before the counting.", "s", 0.0, 60.0),
+        Parameter("hoard_mb", int, 0, "Memory to hold meanwhile.", "MB", 0, 4000),
     ),
 )
 
@@ -28,8 +29,9 @@ def run(job: Job) -> None:
     (job.out / "words.json").write_text("{")
     if "TOY_PID" in os.environ:
         Path(os.environ["TOY_PID"]).write_text(str(os.getpid()))
+    hoard = b"x" * (job.params.hoard_mb << 20)
     for _ in job.progress(range(int(job.params.pause_s * 10)), "pause"):
-        time.sleep(0.1)
+        time.sleep(0.1 + 0 * len(hoard))
     if "TOY_FAIL" in os.environ:
         raise ValueError("the abacus broke")
     words: dict[str, int] = {}
