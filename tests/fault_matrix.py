@@ -88,11 +88,17 @@ class Bench:
         return found
 
     def prepared(self, out: Path, until: str) -> Path:
-        """out/anna with the results of all stages before `until`."""
+        """out/anna with the results of all stages but this one, so that it has to run."""
         run = out / "anna"
-        for name in self.stages[:self.stages.index(until)]:
-            shutil.copytree(self.reference / folder_of(name), run / folder_of(name))
+        for name in self.stages:
+            if name != until:
+                shutil.copytree(self.reference / folder_of(name), run / folder_of(name))
         return run
+
+    def only_before(self, out: Path, until: str) -> None:
+        """Removes the results of all stages after this one, too: they have to be made again."""
+        for name in self.stages[self.stages.index(until) + 1:]:
+            shutil.rmtree(out / "anna" / folder_of(name))
 
     def judge(self, out: Path, **environment: str) -> list[str]:
         """Runs once more; what is wrong then."""
@@ -140,6 +146,8 @@ def kill(bench: Bench, out: Path, number: int) -> list[str]:
     stage = bench.stages[number % len(bench.stages)]
     victim = ("limn", "stage", "all")[number // len(bench.stages) % 3]
     bench.prepared(out, stage)
+    if number % 4 == 0:
+        bench.only_before(out, stage)
     process = bench.start(out)
     began = bench.wait_for_stage(process, out, stage)
     time.sleep(bench.rng.uniform(0, 1.2) * bench.stage_seconds[stage])
@@ -183,6 +191,8 @@ def read_only(bench: Bench, out: Path, number: int) -> list[str]:
     with mounted(out):
         if number % 2:
             bench.prepared(out, bench.stages[-1])
+        else:
+            (out / "anna").mkdir()
         before = contents(out)
         subprocess.run(["mount", "-o", "remount,ro", str(out)], check=True)
         code, output = bench.run(out)
