@@ -1,12 +1,13 @@
 # make demo    set-up, then the embedded subject from clip to scores
 # make test    set-up, then all tests
 # make setup   the set-up alone
+# make audit   licences, changed files, bill of materials; ADVISORIES=all.zip: known vulnerabilities, too
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test lint audit clean
 
 setup: $(STAMP)
 	$(BIN)/python -m tools.check_host
@@ -26,6 +27,9 @@ test: setup
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
+
+audit: $(STAMP)
+	$(BIN)/python -m tools.audit --sbom build/sbom.json $(if $(ADVISORIES),--advisories $(ADVISORIES))
 
 clean:
 	rm -rf demo build
