@@ -158,8 +158,23 @@ def test_killed_jobs_are_tried_again_and_failed_ones_are_not(tmp_path, monkeypat
     for kinds, code in ((["started", "progress"], None), (["started", "failed"], 1), (["input_error"], 2)):
         events.write_text("".join(json.dumps({"kind": kind}) + "\n" for kind in kinds))
         assert launch.earlier_verdict(events) == code
+    events.write_text('{"kind": "fail')
+    assert launch.earlier_verdict(events) is None
     monkeypatch.setenv("LIMN_ATTEMPT", "1")
     assert launch.earlier_verdict(events) is None
+
+
+def test_events_that_are_none_are_passed_over(tmp_path):
+    from tools.watch import Track
+
+    lines = ['{"kind": "started", "time": 3}', '{"kind": "started"}', "7", '{"kind": ["a"]}', "{", '{"kind": "made up"}',
+             '{"kind": "progress", "label": 1, "done": 2, "total": 3}',
+             '{"kind": "progress", "label": "light", "done": 2, "total": null}']
+    (tmp_path / "a.jsonl").write_text("\n".join(lines) + "\n")
+    track = Track("anna", "read_text", tmp_path / "a.jsonl")
+    for event in track.new_events():
+        track.apply(event)
+    assert (track.state, track.since, track.progress) == ("running", 3, "light 2")
 
 
 def test_too_little_space_is_told_before_a_stage_starts(pipeline, tmp_path, capsys):

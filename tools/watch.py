@@ -13,6 +13,11 @@ from pathlib import Path
 from shared.contract.progress import terminal_bar
 
 _LINE_S = 10.0
+_FIELDS: dict[str, dict[str, tuple]] = {
+    "started": {"time": (int, float)}, "current": {}, "done": {"seconds": (int, float)}, "warning": {"text": (str,)},
+    "progress": {"label": (str,), "done": (int,), "total": (int, type(None))}, "input_error": {"message": (str,)},
+    "failed": {"message": (str,), "log": (str,), "last": (list,)},
+}
 _ENDS = {"current": "current", "done": "done", "input_error": "input error", "failed": "failed"}
 
 
@@ -50,7 +55,7 @@ class Track:
         for line in whole.splitlines():
             with contextlib.suppress(ValueError):  # a line that a full disk cut
                 events.append(json.loads(line))
-        return [event for event in events if isinstance(event, dict) and "kind" in event]
+        return [event for event in events if isinstance(event, dict) and is_event(event)]
 
     def apply(self, event: dict) -> None:
         """Takes over what an event says. A stage that starts again (a retry) leaves its earlier end behind."""
@@ -69,6 +74,13 @@ class Track:
         """How far the running stage is, in words."""
         whole = f"/{self.total}" if self.total is not None else ""
         return f"{self.label} {self.done}{whole}" if self.label else "started"
+
+
+def is_event(event: dict) -> bool:
+    """Whether a record has all that its kind of event needs: event files lie in folders that strangers may hand over."""
+    kind = event.get("kind")
+    fields = _FIELDS.get(kind) if isinstance(kind, str) else None
+    return fields is not None and all(isinstance(event.get(name), types) for name, types in fields.items())
 
 
 class Watch:

@@ -39,8 +39,12 @@ def earlier_verdict(events: Path | None) -> int | None:
     """
     if events is None or int(os.environ.get("LIMN_ATTEMPT", "1")) < 2 or not events.is_file():
         return None
-    kinds = [json.loads(line)["kind"] for line in events.read_text(encoding="utf-8").splitlines()]
-    return {"input_error": 2, "failed": 1}.get(kinds[-1]) if kinds else None
+    last = events.read_text(encoding="utf-8").splitlines()[-1:]
+    try:
+        kind = json.loads(last[0])["kind"] if last else None
+    except (ValueError, KeyError, TypeError):  # cut while it was written
+        return None
+    return {"input_error": 2, "failed": 1}.get(kind)
 
 
 def main() -> int:
