@@ -1,4 +1,4 @@
-"""The corpus of bad inputs, as far as it is refused quickly: one clear line, exit code 2, nothing written, no traceback.
+"""The corpus of bad inputs, as far as it is refused quickly: one clear line, exit code 2, nothing written.
 
 `python tests/bad_inputs/measure.py` runs all of it to the end, those that give a result too.
 """

@@ -167,7 +167,7 @@ def test_killed_jobs_are_tried_again_and_failed_ones_are_not(tmp_path, monkeypat
 def test_events_that_are_none_are_passed_over(tmp_path):
     from tools.watch import Track
 
-    lines = ['{"kind": "started", "time": 3}', '{"kind": "started"}', "7", '{"kind": ["a"]}', "{", '{"kind": "made up"}',
+    lines = ['{"kind": "started", "time": 3}', '{"kind": "started"}', "7", '{"kind": ["a"]}', "{", '{"kind": "b"}',
              '{"kind": "progress", "label": 1, "done": 2, "total": 3}',
              '{"kind": "progress", "label": "light", "done": 2, "total": null}']
     (tmp_path / "a.jsonl").write_text("\n".join(lines) + "\n")
