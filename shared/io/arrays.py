@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -51,10 +52,7 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray
     if member.compress_type not in _METHODS:
         raise ValueError(f"{member.filename}: compressed in a way that is not used for arrays")
     data = io.BytesIO(archive.read(member))
-    version = np.lib.format.read_magic(data)
-    if version not in _HEADERS:
-        raise ValueError(f"{member.filename}: format {version}")
-    shape, fortran, dtype = _HEADERS[version](data)
+    shape, fortran, dtype = _read_header(data)
     if dtype.hasobject or dtype.kind not in "biufcSU" or dtype.itemsize == 0:
         raise ValueError(f"{member.filename}: holds {dtype}, not plain numbers or text")
     count = math.prod(shape)
@@ -62,6 +60,21 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray
         raise ValueError(f"{member.filename}: another length than its header says")
     values = np.frombuffer(data.getbuffer(), dtype, count, data.tell()).copy()
     return values.reshape(shape, order="F" if fortran else "C")
+
+
+def _read_header(data: io.BytesIO) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, order and type as an .npy header states them; ValueError where it is none.
+
+    The header is a Python literal, and what numpy raises for broken ones depends on where they break.
+    """
+    version = np.lib.format.read_magic(data)
+    if version not in _HEADERS:
+        raise ValueError(f"format {version}")
+    try:
+        return _HEADERS[version](data)
+    except (TypeError, SyntaxError, tokenize.TokenError, LookupError, AttributeError, RecursionError, ArithmeticError,
+            MemoryError) as error:
+        raise ValueError(f"not an array's header: {error}") from error
 
 
 def write_json(path: Path | str, content: object) -> None:

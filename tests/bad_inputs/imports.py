@@ -87,6 +87,9 @@ IMPORTS = {
     "import: a header that claims a terabyte": (
         "landmarks", lambda path: archive(path, landmarks_px=header((1 << 27, 468, 2)), frame_index=header((1,))),
         "another length"),
+    "import: a header that is cut off": (
+        "landmarks", lambda path: archive(path, landmarks_px=b"\x93NUMPY\x01\x00\x05\x00\x00\x01(\x00\x00",
+                                          frame_index=b""), "not a readable"),
     "import: text": ("landmarks", lambda path: path.write_text("468 landmarks\n"), "not a readable"),
     "import: a cut file": ("poses", half_zip, "not a readable"),
     "import: NaN": ("poses", spoilt(np.nan), "not finite"),
