@@ -81,6 +81,8 @@ def measure(case: Case, scratch: Path) -> dict:
         "too large": peak_mb > LARGEST_MB,
         "files of the subject changed": after != before,
         "something was executed": (scratch / CANARY).exists() or Path(CANARY).exists(),
+        "markup in the report": any("<img src=x" in page.read_text(encoding="utf-8", errors="replace")
+                                    for page in (scratch / "out").rglob("report.html")),
         "leftovers": bool(case.words) and any((scratch / "out").rglob("*.tmp-*")),
     }.items() if is_so]
     if faults:
