@@ -22,7 +22,7 @@ def display_codes(codes: np.ndarray, transfer: str) -> np.ndarray:
     """Source code values [H, W, 3] -> uint8 sRGB: what the networks were trained on. ValueError: unknown transfer."""
     if transfer == "srgb" and codes.dtype == np.uint8:
         return codes
-    table = np.rint(encode_srgb(_decode_table(codes.dtype, transfer)) * 255).astype(np.uint8)
+    table = np.rint(encode_srgb(decode_table(codes.dtype, transfer)) * 255).astype(np.uint8)
     return table[codes]
 
 
@@ -33,7 +33,7 @@ def area_average(codes: np.ndarray, size: tuple[int, int], transfer: str) -> np.
     """
     if size == (codes.shape[1], codes.shape[0]):
         return codes
-    table = _decode_table(codes.dtype, transfer)
+    table = decode_table(codes.dtype, transfer)
     linear = cv2.resize(table[codes], size, interpolation=cv2.INTER_AREA)
     return np.rint(np.interp(linear, table, np.arange(len(table)))).astype(codes.dtype)
 
@@ -80,7 +80,7 @@ def is_grey(codes: np.ndarray) -> bool:
     return spread < 0.005 * np.iinfo(codes.dtype).max
 
 
-def _decode_table(dtype: np.dtype, transfer: str) -> np.ndarray:
+def decode_table(dtype: np.dtype, transfer: str) -> np.ndarray:
     """Linear value of every code of the dtype."""
     maximum = np.iinfo(dtype).max
     return decode_transfer(np.arange(maximum + 1) / maximum, transfer)

@@ -55,6 +55,7 @@ STAGE = Stage(
                   0.01, 2.0),
         Parameter("light_smoothness", float, 1.0, "Weight of the light's smoothness.", "", 0.0, 1000.0),
         Parameter("evidence", float, 5000.0, "How many independent samples the clip counts as.", "", 10.0, 1e7),
+        Parameter("chart", bool, True, "Take the light's scale from the colour chart that sample_frames found."),
         Parameter("render_count", int, 8, "Frames to re-render, spread evenly.", "frames", 1, 2000),
         Parameter("mesh", str, "", "Mesh (.npz or .obj) to use instead of the tracked one; empty: tracked.",
                   file=True),
@@ -139,7 +140,8 @@ def run(job: Job) -> None:
 
     folders = job.input("sample_frames"), job.input("track_landmarks")
     inputs, frames, frame_index = read_inputs(*folders, job.params.mesh, job.params.poses)
-    result = solve_clip(inputs, read_settings(job), job.progress, job.note)
+    sights = inputs.chart_sights() if job.params.chart else ()
+    result = solve_clip(inputs, read_settings(job), job.progress, job.note, sights)
     record = summarise(inputs, result, frame_index)
     for text in record["warnings"]:
         job.warn(text)

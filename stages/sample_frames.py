@@ -1,12 +1,13 @@
 """Sample frames: from the clip to cropped, lossless frames with masks.
 
 Reads    the subject's video (or numbered images), lens and transfer function.
-Writes   frames.json, frames/%06d.png (the crop in the source's own code values), masks/%06d.png, contact_sheet.png.
+Writes   frames.json, frames/%06d.png (the crop in the source's own code values), masks/%06d.png, contact_sheet.png;
+         chart.png where a colour chart is in view.
 Method   A first pass looks at up to four times as many frames as wanted, in small: follows the faces, and measures
          sharpness and change against the neighbours. Faulty, black, alien, faceless, repeated and blurred frames go,
          each with its reason; the rest is thinned to an even spacing in time. One crop holds the whole head in all of
-         them. A second pass decodes just these frames in full. Codes are stored as they are and linearised when read:
-         rounding linear light to integers would lose the shadows.
+         them. A second pass decodes just these frames in full, and looks for a colour chart in a dozen of them. Codes
+         are stored as they are and linearised when read: rounding linear light to integers would lose the shadows.
 Fails    nothing can be decoded; no face is found; fewer than three frames are usable.
 """
 
@@ -15,11 +16,11 @@ from __future__ import annotations
 import numpy as np
 
 from shared.contract import Job, Output, Parameter, Stage, main
-from shared.errors import LimnError
+from shared.errors import InputError, LimnError
 
 STAGE = Stage(
     name="sample_frames",
-    version=1,
+    version=2,
     help="Decode the clip, choose good frames evenly in time, crop them to the head and mask the person.",
     inputs=(),
     outputs=(
@@ -27,6 +28,8 @@ STAGE = Stage(
         Output("frames/*.png", "the crop in the source's code values", space="crop", colour_space="source"),
         Output("masks/*.png", "0 background, 128 person, 255 face", space="crop"),
         Output("contact_sheet.png", "nine of the crops with their masks' outlines", colour_space="srgb"),
+        Output("chart.png", "the colour chart as found, each patch with the colour it should have", optional=True,
+               colour_space="srgb"),
     ),
     parameters=(
         Parameter("frame_count", int, 150, "Frames to keep at most.", "frames", 3, 2000),
@@ -52,6 +55,7 @@ def run(job: Job) -> None:
     subject, params = job.subject, job.params
     reader, networks = open_video(subject.video), load_face_networks()
     info = reader.info
+    chart = watch_for_chart(reader, job)
     survey = survey_clip(reader, networks, subject.transfer, params.frame_count, job.progress)
     selection = select_frames(survey, info, str(subject.video), frame_count=params.frame_count,
                               max_size=params.max_size, blurred_below=params.blurred_below,
@@ -59,9 +63,9 @@ def run(job: Job) -> None:
     job.note(selection.summary)
     intrinsics, focal_known, focal_warning = source_intrinsics(
         info, subject.focal_length_px, subject.focal_length_mm, subject.sensor_width_mm)
-    records, picture_warnings = write_frames(reader, selection, networks, job)
+    records, picture_warnings = write_frames(reader, selection, networks, chart, job)
     warnings = [*info.warnings, *transfer_warnings(info.transfer_tag, subject.transfer), *selection.warnings,
-                *picture_warnings, *[focal_warning] * (not focal_known)]
+                *picture_warnings, *chart.warnings(), *[focal_warning] * (not focal_known)]
     write_json(job.out / "frames.json", {
         "source": {"name": subject.video.name, "width": info.width, "height": info.height, "fps": info.fps,
                    "frame_count": info.frame_count, "codec": info.codec, "rotation_deg": info.rotation},
@@ -72,6 +76,7 @@ def run(job: Job) -> None:
         "intrinsics": crop_intrinsics(intrinsics, selection.crop).tolist(),
         "intrinsics_source": intrinsics.tolist(),
         "focal_known": focal_known,
+        "chart": chart.record(),
         "frames": records,
         "dropped": selection.dropped,
         "warnings": warnings,
@@ -89,7 +94,25 @@ def transfer_warnings(tag: str, transfer: str) -> list[str]:
     return []
 
 
-def write_frames(reader, selection, networks, job: Job) -> tuple[list[dict], list[str]]:
+def watch_for_chart(reader, job: Job):
+    """A ChartWatch for the second pass; a frame that the subject points at is looked at now."""
+    from shared.chart_watch import ChartWatch
+
+    place = job.subject.chart
+    chart = ChartWatch(place, job.subject.transfer)
+    if place.frame is not None:
+        where, size = f"{job.subject.folder / 'subject.yaml'}: chart", (reader.info.width, reader.info.height)
+        if any(not 0 <= value <= size[axis] for corner in place.corners for axis, value in enumerate(corner)):
+            raise InputError("corners outside the picture", where=where, expected=f"inside {size[0]} x {size[1]} px")
+        frame = next(iter(reader.frames([place.frame])), None)
+        if frame is None or frame.fault:
+            raise InputError("the clip has no such frame", where=f"{where}.frame", got=place.frame,
+                             expected=f"0 .. {reader.info.frame_count - 1}")
+        chart.look_at_given(frame.codes())
+    return chart
+
+
+def write_frames(reader, selection, networks, chart, job: Job) -> tuple[list[dict], list[str]]:
     """The second pass: crops, masks and the contact sheet -> one record per frame, and warnings."""
     from shared.contact_sheet import ContactSheet
     from shared.crop_pixels import area_average, clipped_share, display_codes, frame_mask, is_grey
@@ -99,9 +122,12 @@ def write_frames(reader, selection, networks, job: Job) -> tuple[list[dict], lis
         (job.out / folder).mkdir(parents=True, exist_ok=True)
     crop, transfer, count = selection.crop, job.subject.transfer, len(selection.frame_index)
     sheet, records, clipped, grey = ContactSheet(count), [], [], []
+    chart.expect(count)
     frames = reader.frames(selection.frame_index)
     for i, frame in enumerate(job.progress(frames, "cropping", total=count)):
-        part = frame.codes()[crop.y0:crop.y0 + crop.height, crop.x0:crop.x0 + crop.width]
+        whole = frame.codes()
+        chart.look(i, frame.index, whole)
+        part = whole[crop.y0:crop.y0 + crop.height, crop.x0:crop.x0 + crop.width]
         codes = area_average(part, crop.size, transfer)
         rgb = display_codes(codes, transfer)
         points = (selection.landmarks[i][:, :2] - (crop.x0, crop.y0)) * crop.scale
@@ -113,6 +139,8 @@ def write_frames(reader, selection, networks, job: Job) -> tuple[list[dict], lis
         grey.append(is_grey(codes))
         sheet.add(rgb, mask)
     write_png(job.out / "contact_sheet.png", sheet.picture())
+    if chart.picture is not None:
+        write_png(job.out / "chart.png", chart.picture)
     warnings = []
     if np.mean(clipped) > CLIPPED_WARNING:
         warnings.append(f"{np.mean(clipped):.0%} of the face is overexposed: expose it darker")

@@ -4,6 +4,7 @@ import pytest
 from toy_runs import copy_pipeline, make_subject
 
 from shared.contract import Output, Parameter, Stage, load_subject
+from shared.contract.chart_place import AUTO
 from shared.contract.declare import parameter_table
 from shared.contract.folders import RunFolder
 from shared.contract.hashing import HashMemory
@@ -103,6 +104,24 @@ def test_files_of_another_tracker_are_inputs_of_the_stage_that_reads_them(tmp_pa
     assert len(set(keys)) == 3
     for tracking in ("", "landmarks: q.npz", held):
         assert inputs(other, b"others", tracking) == inputs(other)
+
+
+def test_where_a_chart_is_matters_to_the_stage_that_reads_the_clip_alone(tmp_path):
+    folder = make_subject(tmp_path / "eve", settings="video: clip.txt\n")
+    outputs = (Output("text.txt", "the text"),)
+    first, later = Stage("sample", 1, "Samples.", (), outputs), Stage("track", 1, "Tracks.", ("sample",), outputs)
+
+    def inputs(stage, chart):
+        (folder / "subject.yaml").write_text(f"video: clip.txt\nchart: {chart}\n")
+        return source_inputs(stage, load_subject(folder), HashMemory(tmp_path / "hashes.json"))
+
+    place = "{frame: 3, corners: [[0, 0], [9, 0], [9, 6], [0, 6]]}"
+    assert load_subject(folder).chart == AUTO
+    assert set(inputs(first, "auto")) == {"subject.yaml", "video"} == set(inputs(first, "true"))
+    assert set(inputs(first, "off")) == {"subject.yaml", "video", "chart"}
+    assert inputs(first, place)["chart"] not in (inputs(first, "off")["chart"], inputs(first, place.replace("3", "4")))
+    assert load_subject(folder).chart.corners == ((0.0, 0.0), (9.0, 0.0), (9.0, 6.0), (0.0, 6.0))
+    assert inputs(later, place) == inputs(later, "auto")
 
 
 def test_declaration_is_read_without_the_stage_s_imports(tmp_path):

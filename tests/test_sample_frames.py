@@ -5,6 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+from toy_chart import draw_chart
 from toy_video import DrawnFaceNetworks, drawn_face, turning_face, write_video
 
 from shared.clip_survey import ClipSurvey
@@ -153,6 +154,43 @@ def test_warnings_name_what_a_person_should_know(tmp_path, subject):
     warnings = " | ".join(frames_json(out)["warnings"])
     for words in ("2 faces", "px high", "8 usable frames", "overexposed"):
         assert words in warnings
+
+
+def with_chart(frames, white=(0.9, 0.8, 0.7)):
+    """The clip with a colour chart below, in a picture twice as high; the grid's corners [4, 2] px in it."""
+    chart, corners = draw_chart(white, 24, size=(240, 200))
+    return [np.vstack([frame, chart]) for frame in frames], corners + [0, 200]
+
+
+def test_stage_finds_a_colour_chart_outside_the_crop(tmp_path, subject):
+    frames, corners = with_chart(turning_face(8))
+    code, out = subject(write_video(tmp_path / "clip.mp4", frames, pixel_format="yuv444p"))
+    assert code == 0
+    records = frames_json(out)["chart"]
+    assert [record["frame_index"] for record in records] == FrameSet.open(out).frame_index.tolist()
+    for record in records:
+        assert np.abs(np.array(record["corners"]) - corners).max() < 1.0
+        np.testing.assert_allclose(record["white"], (0.9, 0.8, 0.7), rtol=0.03)
+    assert FrameSet.open(out).chart == tuple(records)
+    assert max(read_png(out / "chart.png").shape) == 640
+
+
+def test_a_person_says_where_the_chart_is_or_that_there_is_none(tmp_path, subject, capsys):
+    frames, corners = with_chart(turning_face(8))
+    video = write_video(tmp_path / "clip.mp4", frames, pixel_format="yuv444p")
+    code, out = subject(video, yaml="chart: off\n")
+    assert code == 0 and frames_json(out)["chart"] == [] and not (out / "chart.png").exists()
+    given = (corners + [[1.5, 1], [-1, 2], [-2, -1], [1, -2]]).round(1).tolist()
+    code, out = subject(video, yaml=f"chart: {{frame: 5, corners: {given}}}\n")
+    assert code == 0
+    (record,) = frames_json(out)["chart"]
+    assert record["frame_index"] == 5 and np.abs(np.array(record["corners"]) - corners).max() < 1.0
+    for chart, words in (({"frame": 50, "corners": given}, "chart.frame: the clip has no such frame"),
+                         ({"frame": 5, "corners": [[x + 900, y] for x, y in given]}, "outside the picture")):
+        capsys.readouterr()
+        assert subject(video, yaml=f"chart: {json.dumps(chart)}\n")[0] == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and words in error
 
 
 class SidewaysNetworks(DrawnFaceNetworks):

@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 
 from shared import brdf
+from shared.chart import CORNERS, reflectances
+from shared.chart_finder import read_chart
 from shared.envmap import latlong_directions
 from shared.errors import InputError
-from shared.geometry import WORLD_FROM_CAMERA, rigid, vector_from_rotation, world_from_head
+from shared.geometry import WORLD_FROM_CAMERA, project, rigid, vector_from_rotation, world_from_head
 from shared.io.images import read_png
 from shared.io.models import load_face_networks
 from shared.mesh import Mesh
 from shared.texture import sample_bilinear
 from tools.synth_camera import Camera, PictureQuality, take_picture
+from tools.synth_chart import Chart, add_chart, chart_irradiance
 from tools.synth_gloss import GlossSamples, glossy_radiance, sample_lobe
 from tools.synth_head import DRIFT_DEG, YAW_DEG, head_turn
 from tools.synth_irradiance import IrradianceQuality, Shot, assemble_atlas, group_irradiance
@@ -171,6 +174,28 @@ def test_lamps_and_smooth_light_add_up_to_the_environment(name):
         sampled = (weights * np.clip(directions @ normal, 0, 1)[:, None]).mean(0)
         np.testing.assert_allclose(sampled, expected, rtol=0.02, atol=1e-3)
         np.testing.assert_allclose(light.lamp_irradiance(normal), expected, rtol=0.03, atol=2e-3)
+
+
+def test_a_chart_in_a_white_furnace_shows_its_reflectances():
+    """Far from the head; close to a black globe each point loses what it covers of the sky: centred on the horizon
+    with angular radius a, it projects to a circular segment of area a - sin a cos a of the unit disc."""
+    light = constant_light()
+    surface = Surface(round_mesh(80.0, np.pi, inward=False, count=16), plain(albedo=(0.0, 0.0, 0.0)))
+    camera, dark = Camera(240, 160, 1000.0), np.zeros((8, 8, 3), np.float32)
+    shot = Shot(rigid(WORLD_FROM_CAMERA, np.array([-600.0, 0.0, 900.0])), np.eye(3), 0, 1)
+    picture = np.full((160, 240, 3), 0.5)
+    chart = Chart(rigid(np.eye(3), np.array([0.0, 0.0, 1000.0])))
+    add_chart(picture, chart, surface, light, dark, shot, camera.intrinsics, 2)
+    corners, _ = project(chart.points(CORNERS), np.eye(4), camera.intrinsics)
+    view = read_chart(picture.astype(np.float32), 99.0, corners)
+    np.testing.assert_allclose(view.corners, corners, atol=0.3)
+    expected = np.maximum(reflectances(), 0.0) * [1, 2, 3]
+    np.testing.assert_allclose(view.patches, expected, rtol=0.02, atol=0.004)
+    assert (picture[:8] == 0.5).all()
+    near = Shot(rigid(WORLD_FROM_CAMERA, np.array([-170.0, 0.0, 1000.0])), np.eye(3), 0, 1)
+    shaded = chart_irradiance(chart, surface, light, dark, near)[2, :, 0] / np.pi
+    angle = np.arcsin(80.0 / (170.0 + 25.0 * np.linspace(-3, 3, 7)))
+    np.testing.assert_allclose(shaded, 1.0 - (angle - np.sin(angle) * np.cos(angle)) / np.pi, atol=0.015)
 
 
 def test_the_result_does_not_depend_on_the_number_of_processes():

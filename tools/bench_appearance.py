@@ -48,6 +48,7 @@ CASES: dict[str, dict] = {
     "harmonics_2": {"light_model": "harmonics_2"},
     "harmonics_4": {"light_model": "harmonics_4"},
     "sun_sky": {"light_model": "sun_sky"},
+    "no_chart": {"chart": False},
 }
 CONFIDENT = 0.5
 RENDERED_FRAMES = 6
@@ -59,13 +60,16 @@ def silent(items: Iterable, label: str = "", total: int | None = None) -> Iterab
     return items
 
 
+class _Job:
+    """The stage's defaults with some parameters changed; InputError for unknown ones."""
+
+    def __init__(self, changes: dict):
+        self.params = Parameters({**STAGE.defaults(), **STAGE.parse(changes, "tools.bench_appearance")})
+
+
 def settings_of(changes: dict):
-    """The stage's defaults with some parameters changed -> the solver's settings. InputError for unknown ones."""
-
-    class _Job:
-        params = Parameters({**STAGE.defaults(), **STAGE.parse(changes, "tools.bench_appearance")})
-
-    return read_settings(_Job())
+    """The solver's settings with some of the stage's parameters changed."""
+    return read_settings(_Job(changes))
 
 
 def open_clip(subject: Path, run: Path, tracked: bool) -> tuple[ClipInputs, np.ndarray]:
@@ -184,12 +188,15 @@ def render_errors(subject: Path, inputs: ClipInputs, result: InverseResult) -> d
 def measure(subject: Path, inputs: ClipInputs, index: np.ndarray, changes: dict, note: Callable) -> tuple[dict, object]:
     """Solves one case and compares it with the truth -> scores and the result."""
     start = time.perf_counter()
-    result = solve_clip(inputs, settings_of(changes), silent, note)
+    job = _Job(changes)
+    sights = inputs.chart_sights() if job.params.chart else ()
+    result = solve_clip(inputs, read_settings(job), silent, note, sights)
     scores = {"seconds": time.perf_counter() - start}
     scores["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     scores |= map_errors(subject, inputs, index, result.maps)
     scores |= light_errors(subject, latlong_from_cube(result.solution.state.light, 128))
-    relit = relight_errors(subject, result, settings_of(changes), inputs.camera_from_head, index)
+    has_relight = (subject / "relight").is_dir()
+    relit = relight_errors(subject, result, settings_of(changes), inputs.camera_from_head, index) if has_relight else {}
     scores |= {f"relight_{name}": [errors["psnr"], errors["psnr_gain"]] for name, errors in relit.items()}
     return scores | render_errors(subject, inputs, result), result
 

@@ -25,6 +25,9 @@ colour: {{transfer: {transfer}}}
 
 # head: camera and light stand still, the head turns. camera: head and light still, the camera is carried around.
 capture: {{moves: {moves}}}
+
+# A 24-patch colour chart in view is found by itself; by hand, or to leave it out:
+# chart: {{frame: 0, corners: [[x, y], [x, y], [x, y], [x, y]]}}   # or off
 """
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from shared.mesh import Mesh
 from tools.synth_camera import Camera, PictureQuality, take_picture
+from tools.synth_chart import Chart, add_chart
 from tools.synth_irradiance import GroupResult, IrradianceQuality, Shot, assemble_atlas, group_irradiance
 from tools.synth_light import EnvironmentLight
 from tools.synth_surface import Materials, Surface
@@ -27,11 +28,12 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 @dataclass(frozen=True)
 class Scene:
-    """A textured mesh and the environments [H, 2 H, 3] that its shots choose from."""
+    """A textured mesh, the environments [H, 2 H, 3] that its shots choose from, and a colour chart in all of them."""
 
     mesh: Mesh
     materials: Materials
     lights: tuple[np.ndarray, ...]
+    chart: Chart | None = None
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,7 @@ class _Worker:
     def __init__(self, scene: Scene, shots: list[Shot], camera: Camera, quality: RenderQuality):
         self.surface = Surface(scene.mesh, scene.materials)
         self.lights = [EnvironmentLight(image) for image in scene.lights]
+        self.chart = scene.chart
         self.shots, self.camera, self.quality = shots, camera, quality
 
     def irradiance(self, group: int) -> GroupResult:
@@ -60,8 +63,11 @@ class _Worker:
         """Shot index, its irradiance [size, size, 3], and whether all buffers are wanted or radiance alone."""
         index, irradiance, with_buffers = task
         shot = self.shots[index]
-        images = take_picture(self.surface, self.lights[shot.light], irradiance, shot, self.camera,
-                              self.quality.picture)
+        light, quality = self.lights[shot.light], self.quality.picture
+        images = take_picture(self.surface, light, irradiance, shot, self.camera, quality)
+        if self.chart is not None:
+            add_chart(images["radiance"], self.chart, self.surface, light, irradiance, shot, self.camera.intrinsics,
+                      2 * quality.sub)
         return images if with_buffers else {"radiance": images["radiance"]}
 
 

@@ -1,6 +1,6 @@
 """Make a head-turn clip whose every truth is known: the demo subject, and at tiny size the tests' subject.
 
-    python -m tools.synthesize DEST [--preset demo|tiny] [--size 400] [--frames 48] [--seed 0] [--light lamp] ...
+    python -m tools.synthesize DEST [--preset demo|tiny] [--size 400] [--frames 48] [--light lamp] [--chart] ...
 
 Writes:  DEST/subject.yaml, capture.json, the clip (video.avi, or frames/%04d.png), synthesis.json (how it was made);
          gt/: mesh.obj, albedo.exr, specular.exr, roughness.exr, mask.exr (UV), envmap.exr, poses.npz, and for some
@@ -32,6 +32,7 @@ from shared.io.arrays import save_arrays, write_json
 from shared.io.models import load_head_model
 from tools import synth_output
 from tools.synth_camera import Camera, PictureQuality
+from tools.synth_chart import place_chart
 from tools.synth_head import PITCH_DEG, YAW_DEG, Head, face_part, head_turn, random_head
 from tools.synth_irradiance import IrradianceQuality, Shot
 from tools.synth_light import ENVIRONMENTS, procedural_environment
@@ -43,6 +44,8 @@ DISTANCE_PER_FOCAL = 950.0 / 60.0
 """The camera stands where the head fills the same part of the picture, whatever its lens."""
 
 TOP_MARGIN_MM = 27.0
+WITH_CHART = 1.5
+"""Width of a picture that holds a chart, relative to its height."""
 FACE_RADIANCE = 0.32
 """Mean linear radiance of the face, seen from the front, to which the exposure is set."""
 RELIGHT_YAWS_DEG = {"front": 0.0, "left15": -15.0, "right15": 15.0}
@@ -54,7 +57,8 @@ class Settings:
 
     level: subdivisions of the head model. noise: standard deviation of the sensor at full scale. lights: the clip's,
     then those of relight/. truth_frames: how many frames get all buffers. mantissa_bits: precision of the truth on
-    disk. face_truth_only: gt/mesh.obj holds the face without the rest of the head.
+    disk. face_truth_only: gt/mesh.obj holds the face without the rest of the head. chart: a colour chart stands beside
+    the head, and the picture is half as wide again to hold it.
     """
 
     size: int = 400
@@ -74,6 +78,7 @@ class Settings:
     mantissa_bits: int = 10
     face_truth_only: bool = False
     video: str = "video.avi"
+    chart: bool = False
     irradiance: IrradianceQuality = IrradianceQuality()
     picture: PictureQuality = PictureQuality()
 
@@ -93,8 +98,11 @@ def synthesize(destination: Path, settings: Settings, processes: int) -> None:
     head = random_head(_model(settings.level), settings.seed, settings.eyes == "closed")
     materials = SkinPainter(head, settings.texture, settings.seed).paint(Complexion(tone=settings.tone))
     lights = tuple(light_of(name, settings) for name in settings.lights)
-    scene = Scene(head.mesh, materials, lights)
-    camera = Camera(settings.size, settings.size, settings.focal_mm / SENSOR_MM * settings.size)
+    distance, height = camera_place(head, settings)
+    chart = place_chart(distance, height, settings.seed) if settings.chart else None
+    scene = Scene(head.mesh, materials, lights, chart)
+    width = round(WITH_CHART * settings.size) if settings.chart else settings.size
+    camera = Camera(width, settings.size, settings.focal_mm / SENSOR_MM * settings.size)
     shots = plan_shots(head, settings)
     truth = np.unique(np.linspace(0, settings.frames - 1, settings.truth_frames).round().astype(int))
     destination.mkdir(parents=True, exist_ok=True)
@@ -110,7 +118,7 @@ def synthesize(destination: Path, settings: Settings, processes: int) -> None:
         _write_relight(destination / "relight", settings, scene, shots[settings.frames:], pictures)
     write_json(destination / "synthesis.json", asdict(settings))
     # Last, so that an interrupted run leaves no subject.
-    lens = settings.focal_mm, SENSOR_MM
+    lens = settings.focal_mm, SENSOR_MM * width / settings.size
     synth_output.write_description(destination, camera, *lens, settings.frames, FPS, settings.video)
 
 
@@ -155,10 +163,15 @@ def light_of(name: str, settings: Settings) -> np.ndarray:
     return (environment * (FACE_RADIANCE * np.pi / (irradiance * skin_albedo))).astype(np.float32)
 
 
+def camera_place(head: Head, settings: Settings) -> tuple[float, float]:
+    """The camera's distance from the head's origin and its height above it, mm."""
+    height = head.mesh.vertices[:, 1].max() + TOP_MARGIN_MM - 0.5 * SENSOR_MM * DISTANCE_PER_FOCAL
+    return DISTANCE_PER_FOCAL * settings.focal_mm, height
+
+
 def plan_shots(head: Head, settings: Settings) -> list[Shot]:
     """The clip's frames, then three views under each further light."""
-    height = head.mesh.vertices[:, 1].max() + TOP_MARGIN_MM - 0.5 * SENSOR_MM * DISTANCE_PER_FOCAL
-    distance = DISTANCE_PER_FOCAL * settings.focal_mm
+    distance, height = camera_place(head, settings)
     poses = list(head_turn(settings.frames, distance, height, settings.seed, settings.yaw_deg, settings.pitch_deg))
     light = [0] * settings.frames
     for index in range(1, len(settings.lights)):
@@ -191,12 +204,14 @@ def parse(arguments: list[str] | None) -> tuple[Path, Settings, int]:
     parser.add_argument("--yaw", dest="yaw_deg", type=float, help="how far the head turns to each side, degrees")
     parser.add_argument("--pitch", dest="pitch_deg", type=float, help="how far it nods up and down, degrees")
     parser.add_argument("--noise", type=float, help="sensor noise at full scale, share of it")
+    parser.add_argument("--chart", action="store_true", help="a colour chart beside the head, in a wider picture")
     parser.add_argument("--processes", type=int, default=2, help="worker processes (default 2)")
     options = parser.parse_args(arguments)
     settings = PRESETS[options.preset]
     given = {name: getattr(options, name) for name in
              ("size", "frames", "seed", "eyes", "tone", "noise", "focal_mm", "yaw_deg", "pitch_deg")}
     settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
+    settings = replace(settings, chart=options.chart)
     if options.light:
         others = tuple(name for name in settings.lights if name != options.light)
         settings = replace(settings, lights=(options.light, *others)[:len(settings.lights)])

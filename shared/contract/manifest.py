@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 
+from shared.contract.chart_place import AUTO
 from shared.contract.declare import Stage
 from shared.contract.hashing import HashMemory, hash_file, hash_value
 from shared.contract.shapes import describe
@@ -16,7 +17,7 @@ from shared.errors import InputError, LimnError
 SCHEMA = 1
 MANIFEST, PROVENANCE, LOG = "manifest.json", "provenance.json", "log.txt"
 RECORDS = (MANIFEST, PROVENANCE, LOG)
-SUBJECT_INPUT, VIDEO_INPUT = "subject.yaml", "video"
+SUBJECT_INPUT, VIDEO_INPUT, CHART_INPUT = "subject.yaml", "video", "chart"
 
 
 @dataclass(frozen=True)
@@ -78,12 +79,14 @@ def make_work(stage: Stage, parameters: Mapping[str, object], inputs: Mapping[st
 def source_inputs(stage: Stage, subject: Subject, memory: HashMemory) -> dict[str, str]:
     """{name: SHA-256} of what the stage reads of the subject itself.
 
-    That is its settings, of the first stage the clip, and files of another tracker.
+    That is its settings, of the first stage the clip and where a colour chart is, and files of another tracker.
     """
     inputs = {SUBJECT_INPUT: hash_value(subject.content())}
     if stage.reads_source:
         files = [[path.name, memory.hash(path)] for path in subject.video_files()]
         inputs[VIDEO_INPUT] = hash_value([subject.video_name(), files])
+        if subject.chart != AUTO:
+            inputs[CHART_INPUT] = hash_value(asdict(subject.chart))
     for name in stage.given:
         if (file := getattr(subject, name)) is not None:
             inputs[name] = hash_value([memory.hash(file), name == "poses" and subject.hold_poses])

@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from shared.contract.chart_place import AUTO, ChartPlace, parse_chart
 from shared.contract.confine import check_link, inside
 from shared.contract.declare import Parameter
 from shared.contract.wording import check_keys, nearest, read_yaml
@@ -32,7 +33,7 @@ class Subject:
     """Facts of subject.yaml. video: absolute path of the file, or of an image sequence with a counter (%05d).
 
     focal_length_px: of the source frame; None with focal_length_mm also None means: estimate it. landmarks, poses:
-    files of another tracker; hold_poses: whether its poses stay as they are.
+    files of another tracker; hold_poses: whether its poses stay as they are. chart: where a colour chart is.
     """
 
     folder: Path
@@ -46,6 +47,7 @@ class Subject:
     landmarks: Path | None = None
     poses: Path | None = None
     hold_poses: bool = False
+    chart: ChartPlace = AUTO
 
     def content(self) -> dict[str, object]:
         """All that every stage depends on, independent of where the folder lies."""
@@ -98,7 +100,7 @@ def _load(folder: Path) -> Subject:
         raise InputError("the folder's name cannot be used", where=str(folder), expected="printable letters in UTF-8",
                          mend="rename it")
     check_link(path, folder)
-    content = check_keys(read_yaml(path), ("video", "camera", "colour", "capture", "tracking"), str(path))
+    content = check_keys(read_yaml(path), ("video", "camera", "colour", "capture", "tracking", "chart"), str(path))
     camera = _camera(check_keys(content.get("camera"), [p.name for p in _CAMERA], f"{path}: camera"), path)
     colour = check_keys(content.get("colour"), ("transfer",), f"{path}: colour")
     capture = check_keys(content.get("capture"), ("moves",), f"{path}: capture")
@@ -106,7 +108,8 @@ def _load(folder: Path) -> Subject:
     transfer = _choice(colour.get("transfer", "srgb"), TRANSFERS, f"{path}: colour.transfer")
     moves = _choice(capture.get("moves", "head"), MOVES, f"{path}: capture.moves")
     given = _tracking(folder, content.get("tracking"), f"{path}: tracking")
-    subject = Subject(folder, name, video, transfer=transfer, moves=moves, **camera, **given)
+    chart = parse_chart(content.get("chart"), f"{path}: chart")
+    subject = Subject(folder, name, video, transfer=transfer, moves=moves, chart=chart, **camera, **given)
     _check_files(subject)
     return subject
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shared.chart import ChartSight
 from shared.color import decode_transfer
 from shared.errors import InputError
 from shared.gather import Picture, prepare_picture
@@ -41,6 +42,11 @@ class ClipInputs:
         steps = np.iinfo(codes.dtype).max
         table = decode_transfer(np.arange(steps + 1) / steps, self.frames.transfer)
         return prepare_picture(codes, table[codes], self.frames.read_mask(i))
+
+    def chart_sights(self) -> tuple[ChartSight, ...]:
+        """The colour chart in the frames where one was found."""
+        index = self.frames.frame_index[self.place]
+        return tuple(ChartSight.from_record(record, self.frames.crop, index) for record in self.frames.chart)
 
 
 def read_inputs(

@@ -21,7 +21,7 @@ class FrameSet:
     """F frames of one clip, cropped: u_crop = (u_source - x0) * scale, pixel centres at integer + 0.5.
 
     frame_index [F] counts the source's frames; intrinsics [3, 3] belong to the crop, intrinsics_source to the full
-    frame; size and source_size are (width, height).
+    frame; size and source_size are (width, height). chart: what a colour chart says, see ChartWatch.record.
     """
 
     folder: Path
@@ -39,6 +39,7 @@ class FrameSet:
     focal_known: bool
     transfer: str
     moves: str
+    chart: tuple[dict, ...] = ()
 
     @classmethod
     def open(cls, folder: Path | str) -> FrameSet:
@@ -67,6 +68,7 @@ class FrameSet:
             focal_known=content["focal_known"],
             transfer=content["transfer"],
             moves=content["moves"],
+            chart=tuple(content.get("chart", ())),
         )
 
     @property

@@ -24,6 +24,7 @@ import torch
 from shared.brdf import hemispherical_albedo
 from shared.gather import Samples
 from shared.lobes import LobeTable, specular_tables
+from shared.solve.chart_scale import ChartStatement
 from shared.solve.light import FrameLight, LightPriors
 from shared.solve.light_models import LampLight, LogLight, make_light_model
 from shared.solve.scale import Highlights, most_likely_irradiance
@@ -72,7 +73,7 @@ class Capture:
 
     points [P] with samples [P, F] and transfer; nodes and their own transfer; directions [J, 3];
     world_from_head [F, 3, 3]; fitted [F] bool (the other frames are held out); skin [P] bool: where the prior on skin
-    reflectance applies.
+    reflectance applies; chart: what a colour chart says about the light's scale.
     """
 
     points: Points
@@ -84,6 +85,7 @@ class Capture:
     world_from_head: np.ndarray
     fitted: np.ndarray
     skin: np.ndarray
+    chart: ChartStatement | None = None
 
 
 @dataclass

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 
-from shared.color import LUMINANCE
+from shared.chart import ChartSight
 from shared.gather import Picture, SurfaceViewer
 from shared.mesh import Mesh
 from shared.raycast import RayScene
@@ -23,6 +23,7 @@ from shared.solve.capture import (
     set_scenery,
     spread_frames,
 )
+from shared.solve.chart_scale import describe_scale, state_chart
 from shared.solve.fit_appearance import Solution, fit_appearance
 from shared.solve.texture import PRIOR_SPREAD, TexelMaterial
 from shared.solve.texture_pass import Clip, TexturePass
@@ -77,12 +78,21 @@ class InverseResult:
     record: dict
 
 
-def solve_clip(inputs: InverseInputs, settings: InverseSettings, progress: Callable, note: Callable) -> InverseResult:
-    """The whole of it. progress(items, label) wraps loops, note(text) logs a line."""
+def solve_clip(
+    inputs: InverseInputs,
+    settings: InverseSettings,
+    progress: Callable,
+    note: Callable,
+    sights: Sequence[ChartSight] = (),
+) -> InverseResult:
+    """The whole of it. progress(items, label) wraps loops, note(text) logs a line; sights: of a colour chart in view.
+    """
     viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
     scenery = set_scenery(viewer, settings.sizes, settings.appearance.visibility)
     fitted = hold_out(len(inputs.camera_from_head), settings.hold_out_every)
-    solution = _solve_light(inputs, settings, viewer, scenery, fitted, progress, note)
+    moves = settings.appearance.light_moves(inputs.moves)
+    chart, warning = state_chart(sights, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves)
+    solution = _solve_light(inputs, settings, viewer, scenery, fitted, chart, progress, note)
     shading = shade_vertices(inputs, settings.appearance, viewer, scenery, solution, progress)
     surface = TexelSurface(inputs.mesh, settings.map_size)
     clip = Clip(inputs.picture, inputs.camera_from_head, inputs.intrinsics, fitted)
@@ -91,7 +101,9 @@ def solve_clip(inputs: InverseInputs, settings: InverseSettings, progress: Calla
     widths = (np.inf, settings.map_size / 16, settings.map_size / 64) if settings.appearance.specular else (np.inf,)
     material, texture_record = texture.run(widths)
     maps = make_maps(surface, material, solution.state.roughness)
-    return InverseResult(solution, material, maps, shading, viewer, fitted, {"texture": texture_record})
+    scale = describe_scale(chart, np.median(solution.state.albedo, axis=0))
+    record = {"texture": texture_record, "albedo_scale": scale, "warnings": [warning] * bool(warning)}
+    return InverseResult(solution, material, maps, shading, viewer, fitted, record)
 
 
 def segment_vertices(inputs: InverseInputs, names: tuple[str, ...]) -> np.ndarray:
@@ -104,7 +116,7 @@ def segment_vertices(inputs: InverseInputs, names: tuple[str, ...]) -> np.ndarra
     return found
 
 
-def _solve_light(inputs, settings, viewer, scenery: Scenery, fitted, progress, note) -> Solution:
+def _solve_light(inputs, settings, viewer, scenery: Scenery, fitted, chart, progress, note) -> Solution:
     chosen = spread_frames(len(inputs.camera_from_head), settings.light_frames)
     # The light's own frames need held-out ones too: where thinning left too few, hold out among the thinned.
     kept = fitted[chosen] if (~fitted[chosen]).sum() >= 2 else hold_out(len(chosen), settings.hold_out_every)
@@ -122,6 +134,7 @@ def _solve_light(inputs, settings, viewer, scenery: Scenery, fitted, progress, n
         count=settings.sizes.points,
         progress=lambda items: progress(items, "tracing visibility"),
     )
+    capture = replace(capture, chart=chart)
     return fit_appearance(capture, settings.appearance, lambda record: note(_describe(record)))
 
 
@@ -178,7 +191,6 @@ def make_maps(surface: TexelSurface, material: TexelMaterial, roughness: float) 
 def summarise(inputs: InverseInputs, result: InverseResult, frame_index: np.ndarray) -> dict:
     """What solve.json says, but for the rendered frames. frame_index [F]: the source's numbers of the frames."""
     solution, state = result.solution, result.solution.state
-    skin = np.median(state.albedo, axis=0)
     seen = result.material.information > 1.0
     return {
         "model": {
@@ -194,12 +206,7 @@ def summarise(inputs: InverseInputs, result: InverseResult, frame_index: np.ndar
             "texture_held_out": result.record["texture"]["held_out"],
         },
         "iterations": list(solution.iterations),
-        "albedo_scale": {
-            "method": "priors: luminance and chroma of reference skins, a light that is white on average, and the "
-            "strength of highlights relative to their usual range",
-            "skin_albedo": [round(float(value), 4) for value in skin],
-            "skin_luminance": round(float(skin @ LUMINANCE), 4),
-        },
+        "albedo_scale": result.record["albedo_scale"],
         "held_out_frames": [int(frame) for frame in frame_index[~result.fitted]],
         "seen_share_of_texels": round(float(seen.mean()), 4),
         "warnings": warnings_about(result),
@@ -208,7 +215,7 @@ def summarise(inputs: InverseInputs, result: InverseResult, frame_index: np.ndar
 
 def warnings_about(result: InverseResult) -> list[str]:
     """What a person should know before trusting the maps."""
-    found, solution = [], result.solution
+    found, solution = list(result.record["warnings"]), result.solution
     if solution.held_out > 1.3 * solution.fitted:
         found.append(
             f"frames held out fit worse ({solution.held_out:.4f}) than fitted ones ({solution.fitted:.4f}): "

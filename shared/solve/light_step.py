@@ -77,8 +77,11 @@ class LightStep:
         highlights = None
         if solver.trust_highlights:
             highlights = solver.highlights(self.irradiance, self.reflection, self.weight)
+        chart = solver.capture.chart
+        if chart is not None:
+            chart = chart.log_factor(solver.state.light, np.exp(log_albedo + log_irradiance))
         log_factor, specular = settle_scale(
-            log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma
+            log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart
         )
         factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]
         solver.state.params = self.model.scaled(solver.state.params, log_factor)

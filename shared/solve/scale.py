@@ -1,7 +1,8 @@
-"""The factor per colour channel between light and albedo: what the clip cannot say, said by stated priors.
+"""The factor per colour channel between light and albedo: what the clip cannot say, said by stated priors, and by a
+colour chart where one is in view.
 
 Twice the light on half the albedo gives the same diffuse picture. Three statements fix the factor, each a normal
-distribution over logarithms:
+distribution over logarithms, and a chart is a fourth (chart_scale):
 
 - skin's luminance: log Y is normal with the median and the spread of reference skins of all tones;
 - skin's chroma lies on the locus of measured skins: log R/G and log B/G are linear in log Y, sigma as found there;
@@ -118,28 +119,38 @@ def settle_scale(
     highlights: Highlights | None,
     specular_prior: tuple[float, float],
     white_sigma: float = WHITE_SIGMA,
+    chart: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, float]:
     """The factor on the light per channel and the specular intensity that are jointly most likely.
 
     The lobe returns the light's own colour and its strength has a known range, so highlights say something about the
     scale that diffuse skin cannot: with the light multiplied by k, channel c wants s k_c = t_c. log_albedo,
-    log_irradiance [3] are the skin's present means; specular_prior: mean of s and standard deviation of its logarithm.
+    log_irradiance [3] are the skin's present means; specular_prior: mean of s and standard deviation of its logarithm;
+    chart: the log factor [3] on the light that a colour chart asks for, and its covariance [3, 3]. With a chart the
+    highlights give s alone: on the scale their range has little to add, and the model's errors pass for highlights.
     -> log k [3], and s as the samples want it under that k (the prior's mean without highlights).
     """
     matrix, right = scale_prior(log_albedo + log_irradiance, white_sigma)
+    if chart is not None:
+        whitening = np.linalg.inv(np.linalg.cholesky(chart[1]))
+        matrix = np.concatenate([matrix, whitening])
+        right = np.concatenate([right, whitening @ (log_irradiance + chart[0])])
     mean, sigma = specular_prior
     alone = np.linalg.lstsq(matrix, right - matrix @ log_irradiance, rcond=None)[0]
     if highlights is None:
         return alone, mean
     best = np.clip(highlights.intensity, 0.05, 2.0)
-    spread = _highlight_spread(highlights, mean)
+    log_factor = alone
+    if chart is None:
+        spread = _highlight_spread(highlights, mean)
 
-    def residuals(x: np.ndarray) -> np.ndarray:
-        amplitude = (x[3] + x[:3] - np.log(best)) / spread
-        amplitude = np.sign(amplitude) * np.sqrt(np.log1p(amplitude**2))
-        return np.concatenate([matrix @ (log_irradiance + x[:3]) - right, amplitude, [(x[3] - np.log(mean)) / sigma]])
+        def residuals(x: np.ndarray) -> np.ndarray:
+            amplitude = (x[3] + x[:3] - np.log(best)) / spread
+            amplitude = np.sign(amplitude) * np.sqrt(np.log1p(amplitude**2))
+            on_skin = matrix @ (log_irradiance + x[:3]) - right
+            return np.concatenate([on_skin, amplitude, [(x[3] - np.log(mean)) / sigma]])
 
-    log_factor = least_squares(residuals, np.append(alone, np.log(mean)), method="lm").x[:3]
+        log_factor = least_squares(residuals, np.append(alone, np.log(mean)), method="lm").x[:3]
     factor, precision = np.exp(log_factor), highlights.precision
     specular = (precision * factor * best).sum() / max((precision * factor**2).sum(), 1e-12)
     return log_factor, float(np.clip(specular, 0.0, 2.0))
