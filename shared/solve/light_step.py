@@ -1,8 +1,9 @@
 """One Gauss-Newton step of the light's parameters with the albedo eliminated, and the loop around it.
 
 The step solves (J^T W J + priors) d = -gradient by conjugate gradients. J is never formed: its product with a change
-of light renders that change for all points and frames and removes what a change of albedo would absorb. J W-projects
-orthogonally, so its transpose needs no second projection.
+of light renders that change for all points and frames and removes what a change of albedo, and once highlights count
+of the specular intensity under its prior, would absorb. That makes J^T W J a Schur complement: its transpose needs no
+second projection.
 
 References: Golub and Pereyra, The differentiation of pseudo-inverses and nonlinear least squares problems whose
 variables separate, 1973; Kaufman, A variable projection method for solving separable nonlinear least squares
@@ -93,13 +94,20 @@ class LightStep:
         """Data and priors with albedo and, once highlights count, specular intensity eliminated; weights held."""
         solver = self.solver
         irradiance, reflection = solver.forward(self.model.radiance(params))
-        specular = solver.state.specular
+        specular, unlikely = solver.state.specular, 0.0
         if solver.trust_highlights:
-            specular = solver.highlights(irradiance, reflection, self.weight).pooled
+            mean, precision = self._specular_prior()
+            specular = solver.highlights(irradiance, reflection, self.weight).most_likely(mean, precision)
+            unlikely = 0.5 * precision * (specular - mean) ** 2
         albedo = solver.eliminate(irradiance, reflection, self.weight, specular)
         model = albedo * irradiance + specular * reflection
         data = 0.5 * self.evidence * float((self.weight * (model - solver.colours).square()).sum())
-        return data + self.model.prior(params, solver.settings.priors)[0]
+        return data + unlikely + self.model.prior(params, solver.settings.priors)[0]
+
+    def _specular_prior(self) -> tuple[float, float]:
+        """Mean and precision of the specular intensity."""
+        mean, sigma = self.solver.settings.specular_prior
+        return mean, (mean * sigma) ** -2
 
     def _render(self, change: np.ndarray) -> torch.Tensor:
         """Change of the model [3, P, F] with the parameters [M, 3], out of the eliminated unknowns' reach."""
@@ -111,7 +119,8 @@ class LightStep:
         result = solver.off_albedo(result, self.irradiance, self.weight)
         if solver.trust_highlights:
             weighted = self.weight * self.pure
-            result -= self.pure * ((weighted * result).sum() / (weighted * self.pure).sum().clamp_min(1e-12))
+            known = (weighted * self.pure).sum() + self._specular_prior()[1] / self.evidence
+            result -= self.pure * ((weighted * result).sum() / known)
         return result
 
     def _adjoint(self, values: torch.Tensor) -> np.ndarray:

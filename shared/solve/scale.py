@@ -60,6 +60,11 @@ class Highlights:
         """The one intensity that fits all channels best."""
         return float((self.intensity * self.precision).sum() / max(self.precision.sum(), 1e-12))
 
+    def most_likely(self, mean: float, precision: float) -> float:
+        """That one under a normal prior of this mean and precision; not negative."""
+        moment = (self.intensity * self.precision).sum() + precision * mean
+        return max(float(moment / (self.precision.sum() + precision)), 0.0)
+
 
 @dataclass(frozen=True)
 class SkinLocus:
@@ -128,7 +133,7 @@ def settle_scale(
     log_irradiance [3] are the skin's present means; specular_prior: mean of s and standard deviation of its logarithm;
     chart: the log factor [3] on the light that a colour chart asks for, and its covariance [3, 3]. With a chart the
     highlights give s alone: on the scale their range has little to add, and the model's errors pass for highlights.
-    -> log k [3], and s as the samples want it under that k (the prior's mean without highlights).
+    -> log k [3], and s, the prior's mean without highlights.
     """
     matrix, right = scale_prior(log_albedo + log_irradiance, white_sigma)
     if chart is not None:
@@ -140,20 +145,21 @@ def settle_scale(
     if highlights is None:
         return alone, mean
     best = np.clip(highlights.intensity, 0.05, 2.0)
-    log_factor = alone
-    if chart is None:
-        spread = _highlight_spread(highlights, mean)
+    spread = _highlight_spread(highlights, mean)
 
-        def residuals(x: np.ndarray) -> np.ndarray:
-            amplitude = (x[3] + x[:3] - np.log(best)) / spread
-            amplitude = np.sign(amplitude) * np.sqrt(np.log1p(amplitude**2))
-            on_skin = matrix @ (log_irradiance + x[:3]) - right
-            return np.concatenate([on_skin, amplitude, [(x[3] - np.log(mean)) / sigma]])
+    def on_highlights(log_factor: np.ndarray, log_intensity: float) -> np.ndarray:
+        amplitude = (log_intensity + log_factor - np.log(best)) / spread
+        robust = np.sign(amplitude) * np.sqrt(np.log1p(amplitude**2))
+        return np.append(robust, (log_intensity - np.log(mean)) / sigma)
 
-        log_factor = least_squares(residuals, np.append(alone, np.log(mean)), method="lm").x[:3]
-    factor, precision = np.exp(log_factor), highlights.precision
-    specular = (precision * factor * best).sum() / max((precision * factor**2).sum(), 1e-12)
-    return log_factor, float(np.clip(specular, 0.0, 2.0))
+    def jointly(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([matrix @ (log_irradiance + x[:3]) - right, on_highlights(x[:3], x[3])])
+
+    if chart is not None:
+        solved = least_squares(lambda x: on_highlights(alone, x[0]), [np.log(mean)], method="lm").x
+        return alone, float(np.exp(solved[0]))
+    solved = least_squares(jointly, np.append(alone, np.log(mean)), method="lm").x
+    return solved[:3], float(np.exp(solved[3]))
 
 
 def _highlight_spread(highlights: Highlights, mean_intensity: float) -> np.ndarray:
