@@ -168,7 +168,7 @@ def test_events_that_are_none_are_passed_over(tmp_path):
     from tools.watch import Track
 
     lines = ['{"kind": "started", "time": 3}', '{"kind": "started"}', "7", '{"kind": ["a"]}', "{", '{"kind": "b"}',
-             '{"kind": "progress", "label": 1, "done": 2, "total": 3}',
+             '{"kind": "progress", "label": 1, "done": 2, "total": 3}', '{"kind": "progress", "label": "a", "done": 2}',
              '{"kind": "progress", "label": "light", "done": 2, "total": null}']
     (tmp_path / "a.jsonl").write_text("\n".join(lines) + "\n")
     track = Track("anna", "read_text", tmp_path / "a.jsonl")

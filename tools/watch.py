@@ -80,7 +80,7 @@ def is_event(event: dict) -> bool:
     """Whether a record has all that its kind of event needs: the files lie in folders that strangers may hand over."""
     kind = event.get("kind")
     fields = _FIELDS.get(kind) if isinstance(kind, str) else None
-    return fields is not None and all(isinstance(event.get(name), types) for name, types in fields.items())
+    return fields is not None and all(isinstance(event.get(name, ...), types) for name, types in fields.items())
 
 
 class Watch:
