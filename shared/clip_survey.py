@@ -7,6 +7,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from shared.background_motion import BackgroundMotion, background_of, contradiction
 from shared.face_tracker import FaceTrack, FaceTracker
 from shared.frame_quality import (
     PROXY_HEIGHT,
@@ -35,6 +36,7 @@ class ClipSurvey:
         self._networks = networks
         self._mask_every = mask_every
         self._tracker = FaceTracker(networks)
+        self._motion = BackgroundMotion()
         self._last_luma: np.ndarray | None = None
         self._proxies: list[np.ndarray] = []
         self._difference: list[float] = []
@@ -66,12 +68,15 @@ class ClipSurvey:
         for track in self._tracker.tracks:
             if track.last is not None:
                 track.sharpness[position] = sharpness(luma, landmark_box(track.last))
+        self._motion.follow(luma)
         if position % (self._mask_every * MASKS_PER_SAMPLE) == 0 and len(self._samples) < SAMPLES:
             self._samples.append(rgb)
         if largest is not None and (position % self._mask_every == 0 or not largest.head_boxes):
             x0, y0, x1, y1 = head_window(largest.last, rgb.shape[1], rgb.shape[0])
             mask = self._networks.person_mask(rgb[y0:y1, x0:x1])
             largest.head_boxes[position] = head_box(largest.last, mask, (x0, y0))
+            background = background_of(luma.shape, mask, (x0, y0, x1, y1))
+            self._motion.set_key(position, luma, background, largest.last)
 
     @property
     def count(self) -> int:
@@ -146,6 +151,12 @@ class ClipSurvey:
         known = np.array(sorted(face.head_boxes))
         offsets = np.stack([face.head_boxes[int(i)] - landmark_box(face.observations[int(i)]) for i in known])
         return faces + interpolate_offsets(positions, known, offsets)
+
+    def motion_contradicts(self, moves: str, reasons: list[str]) -> str:
+        """See background_motion.contradiction. reasons: of `verdicts`; frames that are damaged or show something else
+        do not count."""
+        sound = [not reason or reason.startswith(("blurred", "repeats")) for reason in reasons]
+        return contradiction([s for s in self._motion.stretches if all(sound[s.start:s.end + 1])], moves)
 
     def background_drift(self, positions: np.ndarray, width: int, height: int) -> float:
         """See frame_quality.background_drift; background is what no head or body ever covers at `positions`."""

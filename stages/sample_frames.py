@@ -59,7 +59,7 @@ def run(job: Job) -> None:
     survey = survey_clip(reader, networks, subject.transfer, params.frame_count, job.progress)
     selection = select_frames(survey, info, str(subject.video), frame_count=params.frame_count,
                               max_size=params.max_size, blurred_below=params.blurred_below,
-                              head_moves=subject.moves == "head")
+                              moves=subject.moves)
     job.note(selection.summary)
     intrinsics, focal_known, focal_warning = source_intrinsics(
         info, subject.focal_length_px, subject.focal_length_mm, subject.sensor_width_mm)

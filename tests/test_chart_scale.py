@@ -10,7 +10,7 @@ from shared.chart import CORNERS, PATCHES, ChartSight, patch_sigma, reflectances
 from shared.envmap import cube_directions
 from shared.geometry import WORLD_FROM_CAMERA, rigid
 from shared.raycast import RayScene
-from shared.solve.chart_scale import chart_normals, describe_scale, state_chart
+from shared.solve.chart_scale import chart_normals, describe_scale, doubt_scale, state_chart
 from shared.solve.scale import Highlights, settle_scale
 
 INTRINSICS = np.array([[1500.0, 0.0, 480.0], [0.0, 1500.0, 320.0], [0.0, 0.0, 1.0]])
@@ -164,3 +164,5 @@ def test_what_is_recorded():
     assert described["method"].startswith("a colour chart") and described["chart"]["frames"] == [0]
     assert described["chart"]["irradiance_over_pi"] == [1.0, 1.0, 1.0]
     assert (np.abs(np.log(described["chart"]["priors_alone_factor"])) < 0.3).all()
+    assert doubt_scale(statement, skin) == [] == doubt_scale(None, 3 * skin)
+    assert "in the face's own light" in doubt_scale(statement, 3 * skin)[0]

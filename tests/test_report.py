@@ -286,6 +286,9 @@ def test_gathering_of_warnings_and_left_out_frames(tmp_path):
         ("3 numbers are missing in the sequence", "all frames"),
         ("the images' alpha channel is ignored", "opaque"),
         ("3 of 35744 faces have no area", "Clean the mesh"),
+        ("the background stands still while the head turns by 60 degrees, so the head moved: set capture.moves to head",
+         "Correct capture.moves"),
+        ("the colour chart in frame 6 is not used: its grey patches are overexposed: expose darker", "chart.png"),
         ("3 edges join faces of opposite winding", "Clean the mesh"),
     ],
 )

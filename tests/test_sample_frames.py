@@ -12,9 +12,11 @@ from shared.clip_survey import ClipSurvey
 from shared.color import decode_srgb
 from shared.contract import main
 from shared.face_tracker import FaceTracker
+from shared.geometry import rotation_from_vector
 from shared.io.frames import FrameSet
 from shared.io.images import read_png, write_exr
 from shared.io.video import open_video
+from shared.landmarks import EYE_LEFT, EYE_RIGHT, OVAL
 from stages import sample_frames
 
 
@@ -230,3 +232,41 @@ def test_check_refuses_a_mask_without_a_face(tmp_path, subject, monkeypatch):
     monkeypatch.setattr("shared.crop_pixels.frame_mask", lambda rgb, person, points: np.zeros(rgb.shape[:2], np.uint8))
     code, out = subject(write_video(tmp_path / "clip.mp4", turning_face(5)))
     assert code == 1 and not out.exists()
+
+
+class TurningNetworks(DrawnFaceNetworks):
+    """The drawn face, whose features turn by a degree for each pixel that it wanders to the right."""
+
+    def landmarks(self, rgb, detection):
+        presence, points = super().landmarks(rgb, detection)
+        half = np.ptp(detection.box.reshape(2, 2), axis=0) / 2
+        inner = np.setdiff1d(np.arange(468), [*OVAL, *EYE_LEFT, *EYE_RIGHT])
+        directions = np.random.default_rng(0).normal(size=(len(inner), 3))
+        directions[:, 2] = -np.abs(directions[:, 2])
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        turn = rotation_from_vector(np.array([0.0, np.radians(points[0, 0] - 110.0), 0.0]))
+        points[inner] = directions * [*half, half[0]] @ turn.T + [*points[0, :2], 0.0]
+        return presence, points
+
+
+def before_shelves(frames, shift):
+    """The drawn faces before a wall full of things that is moved by so many px from frame to frame."""
+    rng = np.random.default_rng(3)
+    things = cv2.resize(rng.integers(20, 120, (60, 200), np.uint8), (1000, 300), interpolation=cv2.INTER_CUBIC)
+    pictures = []
+    for i, frame in enumerate(frames):
+        grey = np.repeat(things[:frame.shape[0], 400 - round(shift * i):][:, :frame.shape[1], None], 3, axis=2)
+        reddish = frame[..., 0].astype(int) - frame[..., 2] > 40
+        pictures.append(np.where(reddish[..., None], frame, grey).astype(np.uint8))
+    return pictures
+
+
+@pytest.mark.parametrize("shift, moves, words", [
+    (0, "head", ""), (0, "camera", "set capture.moves to head"),
+    (4, "camera", ""), (4, "head", "set capture.moves to camera")])
+def test_stage_checks_what_moves_against_the_background(tmp_path, subject, shift, moves, words):
+    video = write_video(tmp_path / "clip.mp4", before_shelves(turning_face(30, width=400, size=40), shift))
+    code, out = subject(video, yaml=f"capture: {{moves: {moves}}}\n", networks=TurningNetworks())
+    assert code == 0
+    said = [text for text in frames_json(out)["warnings"] if "capture.moves" in text]
+    assert len(said) == bool(words) and words in "".join(said)

@@ -8,6 +8,12 @@ from __future__ import annotations
 import re
 
 _ADVICE = (
+    (r"capture\.moves",
+     "Correct capture.moves in subject.yaml and run again; if both moved, film again with one of them still: light "
+     "solved under the wrong one turns along with the head."),
+    (r"colour chart",
+     "Look at work/sample_frames/chart.png. The chart should face the camera in the light of the face, without "
+     "overexposed patches or the head's shadow; or give its corners by `chart:` in subject.yaml."),
     (r"tracks ask for a focal length",
      "Correct the lens in subject.yaml; cropping and stabilisation in the camera lengthen it too."),
     (r"focal|lens|sensor", "Give the lens in subject.yaml (camera: focal_length_mm and sensor_width_mm)."),
@@ -43,7 +49,7 @@ _ADVICE = (
      "hands and hair before the face."),
     (r"duplicat|dropped|cut", "Give the untouched camera file, without edits or changes of frame rate."),
     (r"blur|sharpness|focus|jump", "Turn more slowly, with a shorter exposure, and keep the face in focus."),
-    (r"scale|prior|reflectance|chart", "Show a grey card or colour chart in the clip to fix the scale."),
+    (r"scale|prior|reflectance", "Show a 24-patch colour chart in the clip to fix the scale."),
     (r"edges (are shared|join)|faces have no area|winding|degenerate",
      "Clean the mesh in a modelling program if it matters there."),
 )

@@ -46,6 +46,8 @@ TEMPER = 3.0
 """Patches' deviations are shared between channels and neighbours: what the data say for a case counts this much
 less."""
 DIRECTIONS = 1536
+LIKELY_LUMINANCE = (0.03, 0.85)
+"""Of skin: the reference skins' from 0.055 to 0.68, and some room."""
 
 
 @dataclass(frozen=True)
@@ -218,3 +220,11 @@ def describe_scale(chart: ChartStatement | None, skin: np.ndarray) -> dict:
         "log_sigma": np.round(sigma, 4).tolist(),
         "priors_alone_factor": np.round(alone, 4).tolist(),
     }}
+
+
+def doubt_scale(chart: ChartStatement | None, skin: np.ndarray) -> list[str]:
+    """A warning where the skin's albedo [3] under a chart's scale is no skin's."""
+    luminance = float(skin @ LUMINANCE)
+    if chart is None or LIKELY_LUMINANCE[0] < luminance < LIKELY_LUMINANCE[1]:
+        return []
+    return [f"the colour chart gives the skin a luminance of {luminance:.2f}: does it stand in the face's own light?"]

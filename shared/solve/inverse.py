@@ -23,7 +23,7 @@ from shared.solve.capture import (
     set_scenery,
     spread_frames,
 )
-from shared.solve.chart_scale import describe_scale, state_chart
+from shared.solve.chart_scale import describe_scale, doubt_scale, state_chart
 from shared.solve.fit_appearance import Solution, fit_appearance
 from shared.solve.texture import PRIOR_SPREAD, TexelMaterial
 from shared.solve.texture_pass import Clip, TexturePass
@@ -101,8 +101,9 @@ def solve_clip(
     widths = (np.inf, settings.map_size / 16, settings.map_size / 64) if settings.appearance.specular else (np.inf,)
     material, texture_record = texture.run(widths)
     maps = make_maps(surface, material, solution.state.roughness)
-    scale = describe_scale(chart, np.median(solution.state.albedo, axis=0))
-    record = {"texture": texture_record, "albedo_scale": scale, "warnings": [warning] * bool(warning)}
+    skin = np.median(solution.state.albedo, axis=0)
+    warnings = [*[warning] * bool(warning), *doubt_scale(chart, skin)]
+    record = {"texture": texture_record, "albedo_scale": describe_scale(chart, skin), "warnings": warnings}
     return InverseResult(solution, material, maps, shading, viewer, fitted, record)
 
 

@@ -68,11 +68,11 @@ def analysis_size(info: VideoInfo) -> tuple[int, int]:
 
 
 def select_frames(survey: ClipSurvey, info: VideoInfo, where: str, *, frame_count: int, max_size: int,
-                  blurred_below: float, head_moves: bool) -> Selection:
+                  blurred_below: float, moves: str) -> Selection:
     """Keep up to frame_count good frames; InputError without a face or with fewer than three such frames.
 
-    where: the clip, for messages. max_size: px, of the crop. blurred_below: relative sharpness. head_moves: whether
-    the background should stand still.
+    where: the clip, for messages. max_size: px, of the crop. blurred_below: relative sharpness. moves: "head" or
+    "camera"; with the former the background should stand still.
     """
     face = survey.main_face
     if face is None:
@@ -98,7 +98,7 @@ def select_frames(survey: ClipSurvey, info: VideoInfo, where: str, *, frame_coun
         dropped=[{"frame_index": index, "reason": reason}
                  for index, reason in zip(survey.frame_index, reasons, strict=True) if reason],
         warnings=[*_face_warnings(survey, landmarks), *_loss_warnings(reasons, len(kept)),
-                  *_scene_warnings(survey, info, kept, landmarks, head_moves)],
+                  *_scene_warnings(survey, info, kept, landmarks, reasons, moves)],
         summary=f"{len(kept)} of {info.frame_count} frames, dropped: {tally(reasons) or 'none'}; "
                 f"crop {crop.width} x {crop.height} px, scale {crop.scale:g}",
     )
@@ -135,12 +135,15 @@ def _loss_warnings(reasons: list[str], kept: int) -> Iterator[str]:
 
 
 def _scene_warnings(survey: ClipSurvey, info: VideoInfo, kept: np.ndarray, landmarks: list[np.ndarray],
-                    head_moves: bool) -> Iterator[str]:
+                    reasons: list[str], moves: str) -> Iterator[str]:
     limits = np.array([info.width, info.height])
     heads = np.stack([skull_box(points) for points in landmarks])
     out = (heads[:, :2] < 0).any(axis=1) | (heads[:, 2:] > limits).any(axis=1)
     if out.any():
         yield f"the head reaches beyond the picture's edge in {np.count_nonzero(out)} of {len(out)} frames"
     drift = survey.background_drift(kept, *analysis_size(info))
-    if head_moves and drift > DRIFT_WARNING:
+    contradiction = survey.motion_contradicts(moves, reasons)
+    if contradiction:
+        yield contradiction
+    elif moves == "head" and drift > DRIFT_WARNING:
         yield f"the background's brightness wanders by {drift:.0%}: lock the exposure and keep the light still"
