@@ -68,7 +68,7 @@ def test_status_shows_a_running_stage(pipeline, tmp_path, capsys):
     subject = make_subject(tmp_path / "anna")
     process = limn_process("run", subject, "--pipeline", pipeline, "--set", "count_words.pause_s=30")
     arguments = ["status", str(subject), "--pipeline", str(pipeline), "--set", "count_words.pause_s=30"]
-    deadline, text = time.monotonic() + 20, ""
+    deadline, text = time.monotonic() + 60, ""
     while "pause" not in text and time.monotonic() < deadline:
         time.sleep(0.2)
         assert main(arguments) == 0
