@@ -93,7 +93,7 @@ def watched(frames, place=AUTO):
 def test_the_watch_keeps_what_good_frames_say():
     sharp, truth = draw_chart(WHITE, 26, chart_pose(5, 10), seed=1)
     empty, _ = draw_chart(WHITE, 2)
-    watch = watched([empty, sharp, sharp])
+    watch = watched([empty, sharp, sharp, empty])
     records = watch.record()
     assert [record["frame_index"] for record in records] == [10, 20] and watch.warnings() == []
     assert np.abs(np.array(records[0]["corners"]) - truth).max() < 0.6

@@ -62,6 +62,7 @@ def write_toy_work(work: Path, moves: str = "head") -> Path:
     excluded = [{"frame_index": 4, "reason": "landmarks absent"}]
     write_json(work / "track_landmarks" / "tracking.json", {"excluded": excluded, "warnings": []})
     write_png(work / "track_landmarks" / "overlay.png", np.full((40, 120, 3), 90, np.uint8))
+    write_png(work / "sample_frames" / "chart.png", np.full((40, 60, 3), 120, np.uint8))
     _write_solution(work / "inverse_render")
     return work
 

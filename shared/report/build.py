@@ -48,7 +48,7 @@ def result_report(result: Result, frame_count: int) -> str:
     again = result.views.held_out if result.views else {}
     chosen = chosen_frames([*solve["render_frames"], *again], held_out, frame_count)
     angles, position = motion(poses["camera_from_head"], frames.moves)
-    overlay = tracked / "overlay.png"
+    overlay, chart = tracked / "overlay.png", result.folders["sample_frames"] / "chart.png"
     excluded = excluded_frames(result.folders["sample_frames"], tracked)
     content = ReportContent(
         name=result.name,
@@ -63,6 +63,7 @@ def result_report(result: Result, frame_count: int) -> str:
         angles_deg=angles,
         position_mm=position,
         overlay=read_png(overlay) if overlay.is_file() else None,
+        chart=read_png(chart) if chart.is_file() else None,
         excluded=excluded,
         model={**solve.get("model", {}), "albedo_scale": solve.get("albedo_scale")},
         ladder=solve.get("ladder", ()),

@@ -40,7 +40,7 @@ def report_html(content: ReportContent) -> str:
         ("novel", "Novel views", view_sections.novel_section(content.views)),
         ("relit", "Other lights", view_sections.relit_section(content.views)),
         ("visibility", "Visibility", view_sections.visibility_section(content.views)),
-        ("light", "Light", sections.light_section(content.envmap)),
+        ("light", "Light", sections.light_section(content.envmap, content.chart)),
         ("poses", "Motion", sections.pose_section(content)),
         ("tracking", "Tracking", sections.tracking_section(content.overlay)),
         ("excluded", "Frames left out", sections.excluded_section(content.excluded)),

@@ -124,8 +124,15 @@ def map_picture(name: str, values: np.ndarray) -> tuple[np.ndarray, float]:
     return grey_bytes(values, 0.0, high), high
 
 
-def light_section(envmap: np.ndarray) -> str:
-    """The environment map as exposed and four stops darker."""
+_CHART = (
+    "The colour chart as found; the middle of each patch shows the colour that it should have in the light on the "
+    "chart's middle. The grid is green where the chart sets the scale of light and albedo, red where it is not used."
+)
+
+
+def light_section(envmap: np.ndarray, chart: np.ndarray | None = None) -> str:
+    """The environment map as exposed and four stops darker, and the colour chart [H, W, 3] sRGB where one is in view.
+    """
     picture = shrunk(envmap, LIGHT_PIXELS)
     pictures = "".join(
         figure(jpeg_uri(srgb_bytes(picture * gain)), f"environment map {text}", escape(text), zoom=True)
@@ -136,6 +143,8 @@ def light_section(envmap: np.ndarray) -> str:
         "face; left of it is the right side of the picture, the edges are behind the head. Directions that no skin "
         "ever faced are smooth guesses.</p>"
     )
+    if chart is not None:
+        note += figure(jpeg_uri(chart), "the colour chart", _CHART)
     return f'<div class="pair">{pictures}</div>{note}'
 
 
