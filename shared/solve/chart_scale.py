@@ -38,6 +38,8 @@ DEPTHS_MM = np.array([-150.0, -110.0, -80.0, -60.0, -40.0, -20.0, 0.0, 20.0, 45.
 """Of the chart, relative to the head's origin between the ears, away from the camera; traced at these, and linear
 between them in steps of STEP_MM."""
 STEP_MM = 5.0
+LIKELY_DEPTH_MM, DEPTH_SIGMA_MM = -40.0, 60.0
+"""Where people hold a chart: between the ears and the tip of the nose, give or take a hand."""
 MODEL_SIGMA = 0.03
 CHANNEL_SIGMA = 0.01
 """Deviation of the log irradiance that the light's own errors leave on a plane beside the head: of all channels
@@ -78,7 +80,8 @@ class ChartView:
         error = misfit.sum((1, 3)) + ((glare / (GLARE_SIGMA * self.sight.white)) ** 2).sum(-1)
         freedom = max(int((weight > 0).sum()) - 3, 1)
         excess = max(1.0, float(error.min()) / freedom)
-        log_chance = self.log_weight - 0.5 * error / (TEMPER * excess)
+        expected = ((_depths() - LIKELY_DEPTH_MM) / DEPTH_SIGMA_MM)[:, None]
+        log_chance = self.log_weight - 0.5 * (expected**2 + error / (TEMPER * excess))
         chance = np.exp(log_chance - log_chance.max())
         chance = (chance / chance.sum())[..., None]
         factor = np.maximum(factor, 1e-6)
@@ -99,9 +102,14 @@ def _line(x: np.ndarray, y: np.ndarray, weight: np.ndarray, pull: np.ndarray) ->
     return slope, (sy - slope * sx) / total, 1.0 / curvature
 
 
+def _depths() -> np.ndarray:
+    """[D]: every STEP_MM of DEPTHS_MM."""
+    return np.arange(DEPTHS_MM[0], DEPTHS_MM[-1] + 0.5 * STEP_MM, STEP_MM)
+
+
 def _between_depths(values: np.ndarray) -> np.ndarray:
     """[11, ...] at DEPTHS_MM -> the same every STEP_MM."""
-    depth = np.arange(DEPTHS_MM[0], DEPTHS_MM[-1] + 0.5 * STEP_MM, STEP_MM)
+    depth = _depths()
     right = np.clip(np.searchsorted(DEPTHS_MM, depth), 1, len(DEPTHS_MM) - 1)
     part = (depth - DEPTHS_MM[right - 1]) / (DEPTHS_MM[right] - DEPTHS_MM[right - 1])
     part = part.reshape(-1, *[1] * (values.ndim - 1)).astype(values.dtype)
@@ -149,29 +157,33 @@ def state_chart(
     for sight in sights:
         normals, log_weight = chart_normals(sight.corners, intrinsics)
         chance = np.exp(log_weight - log_weight.max())
-        if -(chance @ normals)[2] / chance.sum() > LEAST_COSINE:
+        mean = chance @ normals / chance.sum()
+        if -mean[2] > LEAST_COSINE:
             pose = camera_from_head[sight.frame]
             world_from_camera = pose[:3, :3].T if moves == "camera" else WORLD_FROM_CAMERA
             directions = _sphere(1)[0]
             cosine = np.maximum(directions @ (world_from_camera @ normals.T), 0.0).astype(np.float32)
-            free = _open_directions(sight.corners, scene, pose, intrinsics, directions @ world_from_camera)
+            points = _patch_places(sight.corners, mean, intrinsics, pose[2, 3])
+            free = _open_directions(points, scene, pose, directions @ world_from_camera)
             views.append(ChartView(sight, cosine, log_weight, free))
     if views:
         return ChartStatement(tuple(views)), ""
     return None, "the colour chart is turned away from the camera: not used" if sights else ""
 
 
-def _open_directions(corners: np.ndarray, scene: RayScene, camera_from_head: np.ndarray, intrinsics: np.ndarray,
-                     directions: np.ndarray) -> np.ndarray:
-    """[11 * 24, D] float32, 1 where the head does not cover a direction [D, 3] (camera space) as seen from a patch.
-
-    The chart's depth is that of the head, nearer or farther by DEPTHS_MM; its tilt hardly moves its patches.
-    """
+def _patch_places(corners: np.ndarray, normal: np.ndarray, intrinsics: np.ndarray, head_depth: float) -> np.ndarray:
+    """[11 * 24, 3] mm in camera space: the patches, with the chart's middle at the head's depth plus DEPTHS_MM."""
     from_grid = cv2.getPerspectiveTransform(CORNERS.astype(np.float32), corners.astype(np.float32))
     grid = np.stack(np.divmod(np.arange(PATCHES), COLUMNS)[::-1], 1) + 0.5
-    pixels = cv2.perspectiveTransform(grid.reshape(-1, 1, 2), from_grid).reshape(-1, 2)
-    rays = np.column_stack([(pixels - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]], np.ones(PATCHES)])
-    points = np.concatenate([rays * (camera_from_head[2, 3] + depth) for depth in DEPTHS_MM])
+    pixels = cv2.perspectiveTransform(np.concatenate([grid, CORNERS[2:3] / 2]).reshape(-1, 1, 2), from_grid)[:, 0]
+    rays = np.column_stack([(pixels - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]], np.ones(PATCHES + 1)])
+    along = (rays[-1] @ normal) / (rays[:-1] @ normal)
+    return np.concatenate([rays[:-1] * (along * (head_depth + depth))[:, None] for depth in DEPTHS_MM])
+
+
+def _open_directions(points: np.ndarray, scene: RayScene, camera_from_head: np.ndarray,
+                     directions: np.ndarray) -> np.ndarray:
+    """[N, D] float32, 1 where the head does not cover a direction [D, 3] as seen from a point [N, 3], camera space."""
     head_from_camera = invert_rigid(camera_from_head)
     origins = points @ head_from_camera[:3, :3].T + head_from_camera[:3, 3]
     towards = directions @ head_from_camera[:3, :3].T
