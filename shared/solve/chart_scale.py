@@ -214,10 +214,10 @@ def describe_scale(chart: ChartStatement | None, skin: np.ndarray) -> dict:
     With a chart also what it said: the frames, the irradiance over pi on it, the deviation of its logarithm, and by
     which factor the albedo would be another by the priors alone (without highlights).
     """
-    method = "priors: luminance and chroma of reference skins, a light that is white on average, and the strength of " \
-        "highlights relative to their usual range"
+    priors = "luminance and chroma of reference skins, a light that is white on average"
+    alone = f"priors: {priors}, and the strength of highlights relative to their usual range"
     described = {
-        "method": f"a colour chart in view, and weaker {method}" if chart else method,
+        "method": f"a colour chart in view, and far weaker priors: {priors}" if chart else alone,
         "skin_albedo": np.round(skin, 4).tolist(),
         "skin_luminance": round(float(skin @ LUMINANCE), 4),
     }
@@ -225,12 +225,12 @@ def describe_scale(chart: ChartStatement | None, skin: np.ndarray) -> dict:
         return described
     sights = [view.sight for view in chart.views]
     white, sigma = (np.median([getattr(sight, name) for sight in sights], axis=0) for name in ("white", "log_sigma"))
-    alone = white / np.exp(most_likely_irradiance(np.log(skin * white)))
+    factor = white / np.exp(most_likely_irradiance(np.log(skin * white)))
     return described | {"chart": {
         "frames": [sight.frame_index for sight in sights],
         "irradiance_over_pi": np.round(white, 4).tolist(),
         "log_sigma": np.round(sigma, 4).tolist(),
-        "priors_alone_factor": np.round(alone, 4).tolist(),
+        "priors_alone_factor": np.round(factor, 4).tolist(),
     }}
 
 
