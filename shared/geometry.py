@@ -68,6 +68,12 @@ def world_from_head(camera_from_head: np.ndarray, moves: str) -> np.ndarray:
     return WORLD_FROM_CAMERA @ camera_from_head[..., :3, :3]
 
 
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """The rotation [3, 3] closest to a matrix [3, 3] in the Frobenius norm (Kabsch, 1976)."""
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
 def similarity_from_points(
     source: np.ndarray, target: np.ndarray, with_scale: bool = True, weights: np.ndarray | None = None
 ) -> tuple[float, np.ndarray, np.ndarray]:

@@ -52,11 +52,16 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return normalised(total)
 
 
-def uniform_laplacian(faces: np.ndarray, count: int) -> sparse.csr_matrix:
-    """[F, 3] -> [count, count]: I - D^-1 A, so that L @ x is each vertex minus the mean of its neighbours."""
+def vertex_adjacency(faces: np.ndarray, count: int) -> sparse.csr_matrix:
+    """[F, 3] -> [count, count]: 1 where an edge joins two vertices."""
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     adjacency = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
-    adjacency = ((adjacency + adjacency.T) > 0).astype(np.float64)
+    return ((adjacency + adjacency.T) > 0).astype(np.float64)
+
+
+def uniform_laplacian(faces: np.ndarray, count: int) -> sparse.csr_matrix:
+    """[F, 3] -> [count, count]: I - D^-1 A, so that L @ x is each vertex minus the mean of its neighbours."""
+    adjacency = vertex_adjacency(faces, count)
     degree = np.maximum(np.asarray(adjacency.sum(1)).ravel(), 1.0)
     return (sparse.identity(count) - sparse.diags(1.0 / degree) @ adjacency).tocsr()
 

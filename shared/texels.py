@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse.linalg import spsolve
 
 from shared.gather import Picture, View, sample_colours, sample_inside, sample_limits, texel_size
-from shared.mesh import Mesh, rasterize_uv
+from shared.mesh import Mesh, rasterize_uv, vertex_adjacency
 
 
 @dataclass(frozen=True)
@@ -102,9 +102,7 @@ def smooth_field(
     which a fill in the image cannot. Reference: Rue and Held, Gaussian Markov Random Fields, 2005, section 3.
     """
     count = len(mesh.vertices)
-    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
-    adjacency = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count))
-    adjacency = ((adjacency + adjacency.T) > 0).astype(np.float64)
+    adjacency = vertex_adjacency(mesh.faces, count)
     graph = sparse.diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency
     prior = (graph / step**2 + sparse.identity(count) / spread**2).tocsc()
     right = precision * values + mean / spread**2

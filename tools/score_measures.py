@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from shared.color import delta_e_2000, encode_srgb
-from shared.geometry import camera_centres, similarity_from_points
+from shared.geometry import camera_centres, nearest_rotation, similarity_from_points
 
 DELTA_E_SAMPLES = 100_000
 CLIPPED = 0.98
@@ -56,8 +56,7 @@ def pose_errors(truth: np.ndarray, result: np.ndarray) -> dict:
 
 def pose_errors_own_alignment(truth: np.ndarray, result: np.ndarray) -> dict:
     """Pose errors that no mesh enters: rotations after one mean rotation, camera centres after one similarity."""
-    left, _, right = np.linalg.svd(np.einsum("fji,fjk->ik", truth[:, :3, :3], result[:, :3, :3]))
-    mean = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    mean = nearest_rotation(np.einsum("fji,fjk->ik", truth[:, :3, :3], result[:, :3, :3]))
     source, target = camera_centres(result), camera_centres(truth)
     scale, rotation, shift = similarity_from_points(source, target)
     residual = scale * source @ rotation.T + shift - target

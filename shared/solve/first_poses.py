@@ -39,6 +39,9 @@ LEAST_TRACKS = 30
 
 LANDMARK_NOISE_PX, FLOW_NOISE_PX = 1.0, 0.1
 LANDMARK_PRIOR_MM, FLOW_PRIOR_MM = 5.0, 2.5
+LANDMARK_REACH = 0.08
+"""Landmarks off by more than this share of the face's width don't count."""
+
 LOSS = 2.0
 """Cauchy scale in units of the noise."""
 
@@ -76,10 +79,9 @@ def start_from_landmarks(
         points = triangulate(clip.landmarks_px, given, clip.intrinsics)
         error = project(points, given, clip.intrinsics)[0] - clip.landmarks_px
         return BundleSolution(given, points, error), np.ones(len(given), bool)
-    known = (model.landmark_face >= 0) & (model.landmark_weight > 0)
-    named = model.landmarks(model.template)
-    poses, posed = _posed(clip, named, known)
-    points = np.where(known[:, None], named, np.nan)
+    points = known_landmarks(model, model.template)
+    known = np.isfinite(points[:, 0])
+    poses, posed = _posed(clip, points)
     points[~known] = triangulate(clip.landmarks_px[posed][:, ~known], poses[posed], clip.intrinsics)
     residuals = np.full(clip.landmarks_px.shape, np.nan)
     solution = adjust(
@@ -95,13 +97,28 @@ def start_from_landmarks(
     return BundleSolution(poses, solution.points, residuals), posed
 
 
-def _posed(clip: TrackedClip, named: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    reach_px = 0.08 * clip.face_width_px
+def landmark_poses(clip: TrackedClip, named: np.ndarray) -> list[np.ndarray | None]:
+    """Each frame's pose [4, 4] by robust PnP on its landmarks, None where there is none in front of the camera.
+
+    named [n, 3] of the 468 landmarks on the head, NaN where the model has none.
+    """
+    known, reach_px = np.isfinite(named[:, 0]), LANDMARK_REACH * clip.face_width_px
     poses = [
         pose_from_points(named[known], frame[known], clip.intrinsics, clip.size, reach_px)
         for frame in clip.landmarks_px
     ]
-    posed = np.array([pose is not None and pose[2, 3] > 0 for pose in poses])
+    return [pose if pose is not None and pose[2, 3] > 0 else None for pose in poses]
+
+
+def known_landmarks(model: HeadModel, vertices: np.ndarray) -> np.ndarray:
+    """[468, 3] landmarks on the head's vertices, NaN where the model has none or none that holds still."""
+    known = (model.landmark_face >= 0) & (model.landmark_weight > 0)
+    return np.where(known[:, None], model.landmarks(vertices), np.nan)
+
+
+def _posed(clip: TrackedClip, named: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    poses = landmark_poses(clip, named)
+    posed = np.array([pose is not None for pose in poses])
     if posed.sum() < 3:
         raise InputError(
             "the landmarks fit no head in this clip", got=f"{posed.sum()} frames with a pose", expected="3 or more"

@@ -13,7 +13,7 @@ import numpy as np
 
 from shared.bundle import BundleSolution, adjust, pose_covariance
 from shared.bundle_problem import Tracks
-from shared.geometry import vector_from_rotation
+from shared.geometry import nearest_rotation, vector_from_rotation
 from shared.motion_prior import motion_prior_of
 from shared.solve.first_poses import LOSS, Adjusted, adjust_clip
 from shared.solve.tracked_clip import TrackedClip
@@ -88,15 +88,13 @@ def noise_factor(
 
 def rotations_apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Rotation vectors [F, 3] (camera axes) between rotations [F, 3, 3], but for a common turn of the head."""
-    u, _, vt = np.linalg.svd(np.einsum("fji,fjk->ik", second, first))
-    common = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    common = nearest_rotation(np.einsum("fji,fjk->ik", second, first))
     return vector_from_rotation(first @ np.swapaxes(second @ common, 1, 2))
 
 
 def _turns(rotations: np.ndarray) -> np.ndarray:
     """[F, 3] rotation vectors (camera axes) of rotations [F, 3, 3] from their mean."""
-    u, _, vt = np.linalg.svd(rotations.sum(0))
-    return vector_from_rotation(rotations @ (u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt).T)
+    return vector_from_rotation(rotations @ nearest_rotation(rotations.sum(0)).T)
 
 
 def trust(clip: TrackedClip, last: Adjusted, prior_mm: float, estimate_focal: bool) -> TrustedPoses:

@@ -16,7 +16,6 @@ from shared.bundle_problem import Tracks
 from shared.geometry import camera_centres, project, rigid
 from shared.head_model import HeadModel
 from shared.mesh import normalised
-from shared.pnp import pose_from_points
 from shared.solve.first_poses import (
     LOSS,
     Adjusted,
@@ -24,6 +23,8 @@ from shared.solve.first_poses import (
     flow_over_head,
     flow_over_landmarks,
     interpolate_poses,
+    known_landmarks,
+    landmark_poses,
     start_from_landmarks,
 )
 from shared.solve.fit_head import FitWeights, HeadFit, fit_codes, fit_surface, landmarks_on_points
@@ -37,9 +38,6 @@ LANDMARK_FRAMES = 15
 
 FOLLOW_TEXELS = 3.0
 """Half of what the coarse pass searches; landmarks jitter by less."""
-
-LANDMARK_REACH = 0.08
-"""Landmarks off by more than this share of the face's width don't count."""
 
 HELD_OUT_EVERY = 8
 """One fine track in so many is held out to judge the poses."""
@@ -141,9 +139,7 @@ def _onto_all(clip, model, chosen, fit, found) -> tuple[np.ndarray, np.ndarray]:
         return carried_poses(clip.given_poses, clip.given_poses[chosen], poses), np.ones(clip.count, bool)
     known = np.zeros(clip.count, bool)
     known[chosen[found.reliable]] = True
-    named = model.landmarks(fit.vertices)
-    named[(model.landmark_face < 0) | (model.landmark_weight <= 0)] = np.nan
-    return follow_landmarks(clip, named, poses[found.reliable], known), known
+    return follow_landmarks(clip, known_landmarks(model, fit.vertices), poses[found.reliable], known), known
 
 
 def follow_landmarks(clip: TrackedClip, named: np.ndarray, poses: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -156,12 +152,8 @@ def follow_landmarks(clip: TrackedClip, named: np.ndarray, poses: np.ndarray, kn
     """
     between = interpolate_poses(poses, clip.time_s[known], clip.time_s)
     usable = np.isfinite(named[:, 0])
-    reach_px = LANDMARK_REACH * clip.face_width_px
     limit_px = FOLLOW_TEXELS * coarse_pass(clip.face_width_px).texel_px
-    seen = [
-        pose_from_points(named[usable], frame[usable], clip.intrinsics, clip.size, reach_px)
-        for frame in clip.landmarks_px
-    ]
+    seen = landmark_poses(clip, named)
     both = known & np.array([pose is not None for pose in seen])
     if not both.any():
         return between
