@@ -48,18 +48,23 @@ class LobeTable:
     def __len__(self) -> int:
         return len(self.normals)
 
-    def kernel(self, part: slice, towards: torch.Tensor, roughness: float) -> tuple[torch.Tensor, torch.Tensor]:
+    def kernel(
+        self, part: slice, towards: torch.Tensor, roughness: float | np.ndarray
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Lobe weights of some points from one view each: all directions [p, J], and the open share [p, J].
 
-        towards [p, 3] unit vectors to the camera. The first includes directions that the head blocks. The same
-        function as brdf.specular_cosine times the solid angle, with what does not change factored out; for lobes that
-        slip between the directions the split sum.
+        towards [p, 3] unit vectors to the camera; roughness: one, or each point's [P], then not below `narrowest`. The
+        first includes directions that the head blocks. The same function as brdf.specular_cosine times the solid
+        angle, with what does not change factored out; for lobes that slip between the directions the split sum.
         """
-        if roughness < self.narrowest:
+        if np.ndim(roughness):
+            alpha2 = torch.from_numpy(np.asarray(roughness[part], np.float32))[:, None] ** 4
+        elif roughness < self.narrowest:
             if self._split_sum is None:
                 self._split_sum = SplitSum(self.directions.numpy().T.astype(np.float64))
             return self._split_sum.kernel(self.normals[part], towards, float(roughness), self.visible[part])
-        alpha2 = float(roughness) ** 4
+        else:
+            alpha2 = float(roughness) ** 4
         normals = self.normals[part]
         n_dot_i = normals @ self.directions
         n_dot_o = (normals * towards).sum(1, keepdim=True).clamp_min(MINIMUM_COSINE)
@@ -82,12 +87,16 @@ def _blocks(table: LobeTable) -> list[slice]:
 
 
 def specular_reflection(
-    table: LobeTable, towards: np.ndarray, roughness: float, light: np.ndarray, blocked_light: np.ndarray | None = None
+    table: LobeTable,
+    towards: np.ndarray,
+    roughness: float | np.ndarray,
+    light: np.ndarray,
+    blocked_light: np.ndarray | None = None,
 ) -> np.ndarray:
     """Specular radiance of P points from one camera at specular_intensity 1.
 
-    towards [P, 3]; light [J, C] along the directions; blocked_light [P, C]: mean radiance of what the head itself
-    puts in the way (0 when None) -> [P, C] float32.
+    towards [P, 3]; roughness: one, or each point's [P]; light [J, C] along the directions; blocked_light [P, C]: mean
+    radiance of what the head itself puts in the way (0 when None) -> [P, C] float32.
     """
     light_t = torch.from_numpy(np.ascontiguousarray(light, np.float32))
     towards_t = torch.from_numpy(np.ascontiguousarray(towards, np.float32))
@@ -101,7 +110,7 @@ def specular_reflection(
 
 
 def specular_tables(
-    table: LobeTable, towards: np.ndarray, roughness: float, progress=iter
+    table: LobeTable, towards: np.ndarray, roughness: float | np.ndarray, progress=iter
 ) -> tuple[torch.Tensor, np.ndarray]:
     """The lobes of all points in F views: open weights bfloat16 [F, P, J] and blocked weight float32 [P, F].
 

@@ -31,11 +31,13 @@ DEEP = 0.9
 
 @dataclass(frozen=True)
 class Material:
-    """What bounces need to know of the surface: node_albedo [K, 3], mean specular_intensity, roughness."""
+    """What shading needs to know of the surface: for bounces node_albedo [K, 3], mean specular_intensity and roughness;
+    local_roughness [P] of the shaded points where it varies."""
 
     node_albedo: np.ndarray
     specular_intensity: float
     roughness: float
+    local_roughness: np.ndarray | None = None
 
     def bounce_albedo(self) -> np.ndarray:
         """[K, 3] fraction of light that a node sends on, its specular share included as if it were diffuse."""
@@ -111,10 +113,11 @@ class VertexShading:
             blocked = self._bounced[:, frame].astype(np.float32) / np.maximum(self.transfer.blocked, 1e-3)[:, None]
             facing = np.nonzero((towards * self.points.normals).sum(1) > -0.1)[0]
             value = np.zeros((len(self.points), 3), np.float16)
+            local = self.material.local_roughness
             value[facing] = specular_reflection(
                 self._table.take(facing),
                 towards[facing],
-                self.material.roughness,
+                self.material.roughness if local is None else np.maximum(local[facing], self._table.narrowest),
                 self.light_along[:, frame],
                 blocked[facing],
             )

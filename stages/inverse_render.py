@@ -19,7 +19,7 @@ LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 STAGE = Stage(
     name="inverse_render",
-    version=3,
+    version=4,
     help="Light, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     outputs=(
@@ -49,6 +49,7 @@ STAGE = Stage(
         Parameter("specular", bool, True, "Model specular reflection."),
         Parameter("roughness", float, 0.45, "Roughness to start from.", "", 0.1, 0.7),
         Parameter("search_roughness", bool, True, "Search the roughness; else it stays at its start."),
+        Parameter("local_roughness", bool, True, "Let roughness vary over the skin where held-out frames gain by it."),
         Parameter("specular_prior", float, 0.7, "Expected specular intensity of skin; index of refraction 1.4: 0.7.",
                   "", 0.01, 2.0),
         Parameter("white_light", float, 0.15, "Expected deviation of the light's log colour ratios from grey.", "",
@@ -90,6 +91,7 @@ def read_settings(job: Job):
         specular=params.specular,
         roughness=params.roughness,
         search_roughness=params.search_roughness,
+        local_roughness=params.local_roughness,
         specular_prior=(params.specular_prior, SPECULAR_SPREAD),
     )
     return InverseSettings(

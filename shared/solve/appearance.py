@@ -33,6 +33,8 @@ from shared.transfer import Nodes, Points, Transfer, nearest_points, node_radios
 MINIMUM_ALBEDO, MAXIMUM_ALBEDO = 0.003, 1.0
 ALBEDO_PULL = 25.0
 """Precision of the prior on a point's albedo: a standard deviation of 0.2."""
+CAUCHY = 6.0
+"""Squared errors of so many times their spread get half the weight of small ones."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class Settings:
     specular: bool = True
     roughness: float = 0.45
     search_roughness: bool = True
+    local_roughness: bool = True
     specular_prior: tuple[float, float] = (0.7, 0.25)
 
     def light_moves(self, moves: str) -> str:
@@ -185,10 +188,10 @@ class AppearanceSolver:
             bounce = torch.from_numpy(self.capture.transfer.bounce.astype(np.float32))
             self.baked = torch.stack([self.direct + bounce @ (radiosity[..., c] @ node_direct) for c in range(3)])
 
-    def bake_lobes(self) -> None:
-        """The specular tables [F, P, J] for the present roughness."""
-        towards = self.capture.samples.towards_camera
-        self.lobes, blocked = specular_tables(self.table, towards, self.state.roughness)
+    def bake_lobes(self, roughness: float | np.ndarray | None = None) -> None:
+        """The specular tables [F, P, J] for the present roughness, or for another one or each point's own [P]."""
+        roughness = self.state.roughness if roughness is None else roughness
+        self.lobes, blocked = specular_tables(self.table, self.capture.samples.towards_camera, roughness)
         share = torch.from_numpy(blocked / np.maximum(self.capture.transfer.blocked, 1e-3)[:, None])
         self.blocked_share = share[None]
 
@@ -234,11 +237,29 @@ class AppearanceSolver:
         weight = self.trust * self.precision
         if model is None:
             return weight * (self.limits == 0)
+        error, satisfied = self._errors(model)
+        return weight * (~satisfied) / (1.0 + error / (CAUCHY * self._spread(error, satisfied)))
+
+    def _errors(self, model: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Squared errors over the assumed noise's variance, and where a censored sample is satisfied; [3, P, F]."""
         satisfied = ((self.limits > 0) & (model >= self.colours)) | ((self.limits < 0) & (model <= self.colours))
-        error = (model - self.colours).square() * self.precision
+        return (model - self.colours).square() * self.precision, satisfied
+
+    def _spread(self, error: torch.Tensor, satisfied: torch.Tensor) -> float:
+        """Variance of the errors over the assumed noise's, by their median."""
         used = (self.trust > 0).expand_as(error)
-        scale = error[used & ~satisfied].median().clamp_min(0.05) / 0.4549
-        return weight * (~satisfied) / (1.0 + error / (6.0 * scale))
+        return max(float(error[used & ~satisfied].median()), 0.05) / 0.4549
+
+    def loss(self, model: torch.Tensor, spread: float | None = None) -> tuple[float, float]:
+        """Mean Cauchy loss of the fitted samples, of errors of this spread (None: their own), and that spread.
+
+        What the steps lower: unlike a mean square it does not rise when many samples fit better and a few worse.
+        """
+        error, satisfied = self._errors(model)
+        spread = self._spread(error, satisfied) if spread is None else spread
+        weight = self.trust * self.fitted
+        loss = torch.log1p(error * (~satisfied) / (CAUCHY * spread))
+        return float((weight * loss).sum() / (3.0 * weight.sum())), spread
 
     def eliminate(self, irradiance, reflection, weight, specular: float | None = None) -> torch.Tensor:
         """Albedo [3, P, 1] that fits best given light and specular intensity (the state's when None), from the
@@ -291,8 +312,7 @@ class AppearanceSolver:
 
     def residuals(self, model: torch.Tensor) -> tuple[float, float]:
         """Root mean square residual (linear, trust-weighted, censored) on fitted and on held-out frames."""
-        satisfied = ((self.limits > 0) & (model >= self.colours)) | ((self.limits < 0) & (model <= self.colours))
-        squared = (model - self.colours).square() * (~satisfied)
+        squared = (model - self.colours).square() * (~self._errors(model)[1])
         result = []
         for chosen in (self.fitted, 1.0 - self.fitted):
             weight = self.trust * chosen

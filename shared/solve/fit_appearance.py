@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 
 from shared.solve.appearance import AppearanceSolver, Capture, Settings, State
 from shared.solve.light_step import LightStep
+from shared.solve.local_roughness import ROUGHNESS_RANGE, GlossEquations, local_roughness
 
-ROUGHNESS_RANGE = (0.1, 0.7)
 SHAPING_STEPS = 3
 _ROUGHNESS_FACTOR = 1.18
 _WORTHWHILE, _WORTHWHILE_COARSE = 0.003, 0.03
@@ -19,9 +19,9 @@ _WORTHWHILE, _WORTHWHILE_COARSE = 0.003, 0.03
 several resolutions is left earlier, since what it cannot resolve keeps its residual high."""
 
 _LARGEST_RISE = 1.05
-"""A step after which the fitted residual is higher by more than this factor is undone, and ends its resolution: the
-specular intensity and the scale follow priors as well as samples, and on a clip that contradicts the model (an
-expression that changes, a palette of few colours) they can lead away from it."""
+"""A step after which the robust loss on fitted samples is higher by more than this factor is undone, and ends its
+resolution: the specular intensity and the scale follow priors as well as samples, and on a clip that contradicts the
+model (an expression that changes, a palette of few colours) they can lead away from it."""
 
 _SETTLED = 0.06
 """Roughness is searched once steps lower the residual by less than this: under a light that still takes shape, blur
@@ -31,12 +31,15 @@ ROUGHNESS_SEARCHES = (2, 1)
 
 @dataclass(frozen=True)
 class Solution:
-    """The best State by held-out residual; iterations: one record per step; fitted and held_out: its residuals."""
+    """The best State by held-out residual; iterations: one record per step; fitted and held_out: its residuals; gloss:
+    where roughness varies over the skin, how, and gloss_record what the held-out frames said to that."""
 
     state: State
     iterations: tuple[dict, ...]
     fitted: float
     held_out: float
+    gloss: GlossEquations | None = None
+    gloss_record: dict = field(default_factory=dict)
 
 
 def fit_appearance(
@@ -60,9 +63,9 @@ def fit_appearance(
         kept = None
         for number in range(settings.steps):
             shaping = stage == 0 and number < min(SHAPING_STEPS, settings.steps - 1)
-            record = _step(solver, settings, trusts and not shaping)
+            record, rise = _step(solver, settings, trusts and not shaping)
             record |= {"light": model, "resolution": resolution, "step": number}
-            if kept is not None and record["fitted"] > _LARGEST_RISE * kept[0]["fitted"]:
+            if kept is not None and rise > _LARGEST_RISE:
                 solver.state, solver.lobes, trusts = kept[1], None, False
                 records.append(record | {"undone": True})
                 report(records[-1])
@@ -83,21 +86,30 @@ def fit_appearance(
             elif not shaping and number >= least and judged > last * (1.0 - worthwhile):
                 break
             last = judged
-    return Solution(best[2], tuple(records), best[1]["fitted"], best[1]["held_out"])
+    _, record, state = best
+    gloss, said = None, {}
+    if settings.specular and settings.local_roughness:
+        solver.state = _copy(state)
+        solver.set_light((record["light"], record["resolution"]))
+        gloss, said = local_roughness(solver)
+    return Solution(state, tuple(records), record["fitted"], record["held_out"], gloss, said)
 
 
-def _step(solver: AppearanceSolver, settings: Settings, trusts: bool) -> dict:
-    """One step of everything; trusts: highlights say something about the scale and their own strength."""
+def _step(solver: AppearanceSolver, settings: Settings, trusts: bool) -> tuple[dict, float]:
+    """One step of everything -> its record, and by what factor the robust loss rose; trusts: highlights say something
+    about the scale and their own strength."""
     solver.trust_highlights = trusts
     solver.bake()
     if settings.specular and solver.lobes is None:
         solver.bake_lobes()
     step = LightStep(solver)
+    before, spread = solver.loss(solver.model(step.irradiance, step.reflection))
     step.take()
     step.settle()
     state = solver.state
     state.node_albedo = state.albedo[solver.node_to_point]
     model = solver.model(step.irradiance, step.reflection)
+    rise = solver.loss(model, spread)[0] / before
     solver.measure_misfit(model, step.weight)
     fitted, held_out = solver.residuals(model)
     return {
@@ -106,7 +118,7 @@ def _step(solver: AppearanceSolver, settings: Settings, trusts: bool) -> dict:
         "cost": step.before,
         "specular_intensity": state.specular,
         "roughness": state.roughness,
-    }
+    }, rise
 
 
 def _copy(state: State) -> State:

@@ -100,7 +100,8 @@ def solve_clip(
     texture = TexturePass(surface, viewer, shading, clip, solution.state.specular, typical, progress=progress)
     widths = (np.inf, settings.map_size / 16, settings.map_size / 64) if settings.appearance.specular else (np.inf,)
     material, texture_record = texture.run(widths)
-    maps = make_maps(surface, material, solution.state.roughness)
+    roughness = vertex_roughness(solution, inputs.mesh.vertices)
+    maps = make_maps(surface, material, roughness)
     skin = np.median(solution.state.albedo, axis=0)
     warnings = [*[warning] * bool(warning), *doubt_scale(chart, skin)]
     record = {"texture": texture_record, "albedo_scale": describe_scale(chart, skin), "warnings": warnings}
@@ -161,13 +162,14 @@ def shade_vertices(
     points = mesh_points(viewer.mesh, index)
     transfer = scenery.trace(points, lambda batches: progress(batches, "tracing the surface"))
     state = solution.state
+    local = None if solution.gloss is None else solution.gloss.roughness(points.positions)
     return VertexShading(
         index,
         viewer.mesh.vertices,
         points,
         transfer,
         scenery.node_transfer,
-        Material(state.node_albedo, state.specular, state.roughness),
+        Material(state.node_albedo, state.specular, state.roughness, local),
         state.light,
         scenery.directions,
         inputs.camera_from_head,
@@ -176,14 +178,22 @@ def shade_vertices(
     )
 
 
-def make_maps(surface: TexelSurface, material: TexelMaterial, roughness: float) -> dict[str, np.ndarray]:
-    """UV-space images with filled gutters; confidence is the share of the prior's variance that the clip removed."""
+def vertex_roughness(solution: Solution, vertices: np.ndarray) -> np.ndarray:
+    """[V] at vertices [V, 3] mm."""
+    if solution.gloss is None:
+        return np.full(len(vertices), solution.state.roughness)
+    return solution.gloss.roughness(vertices)
+
+
+def make_maps(surface: TexelSurface, material: TexelMaterial, roughness: np.ndarray) -> dict[str, np.ndarray]:
+    """UV-space images with filled gutters; roughness [V] of the vertices; confidence is the share of the prior's
+    variance that the clip removed."""
     confidence = PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + 1.0 / np.maximum(material.information, 1e-9))
     size = (surface.size, surface.size)
     return {
         "diffuse_albedo": surface.dilated(surface.to_image(material.albedo.astype(np.float32))),
         "specular_intensity": surface.dilated(surface.to_image(material.specular.astype(np.float32))),
-        "roughness": np.full(size, roughness, np.float32),
+        "roughness": surface.dilated(surface.to_image(surface.interpolate(roughness[:, None])[:, 0])),
         "normal": np.broadcast_to(np.array([0.5, 0.5, 1.0], np.float32), size + (3,)).copy(),
         "confidence": surface.to_image(confidence.astype(np.float32)),
     }
@@ -199,6 +209,7 @@ def summarise(inputs: InverseInputs, result: InverseResult, frame_index: np.ndar
             "specular_intensity": round(state.specular, 4),
             "specular_variation": result.record["texture"]["chosen"],
             "roughness": round(state.roughness, 4),
+            "roughness_variation": solution.gloss_record,
             "moves": inputs.moves,
         },
         "residuals": {

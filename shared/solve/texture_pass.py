@@ -22,7 +22,7 @@ from shared.solve.texture import (
 from shared.texels import TexelSamples, TexelSurface, smooth_field
 
 _ALBEDO_PULL = 10.0
-NEIGHBOUR_STEP, SURROUNDINGS_SPREAD = 0.05, 1.0
+NEIGHBOUR_STEP, SURROUNDINGS_SPREAD = 0.05, 3.0
 """Standard deviations of the log albedo: from one vertex to the next, and from the person's typical skin."""
 FIRST_PASS_FRAMES = 32
 """Enough to tell what a texel looks like, so that every frame's samples can be weighed by it."""

@@ -116,19 +116,21 @@ class HeadViews:
         self.points = mesh_points(mesh, self.index)
         wrap = progress or (lambda items, label: items)
         self.transfer: Transfer = self.scenery.trace(self.points, lambda items: wrap(items, "visibility"))
-        self.material = self._bounce_material(mesh, maps)
+        self.material = self._material(mesh, maps)
         # What stands in for a point deep in a cavity is the nearest one in the open. Seen from inside the mouth that
         # can be the outside of the cheek, unless orientation counts as well.
         self._surface_place = np.concatenate([mesh.vertices, ORIENTATION_MM * self.viewer.normals], axis=1)
 
-    def _bounce_material(self, mesh: Mesh, maps: Mapping[str, np.ndarray]) -> Material:
-        """What light that bounces meets: the maps at the nodes."""
+    def _material(self, mesh: Mesh, maps: Mapping[str, np.ndarray]) -> Material:
+        """The maps at the nodes, for light that bounces, and the roughness at the traced points."""
         uv = np.zeros((len(mesh.vertices), 2))
         uv[mesh.faces.ravel()] = mesh.uvs[mesh.face_uvs.ravel()]
         nearest = cKDTree(mesh.vertices).query(self.scenery.nodes.points.positions)[1]
         albedo = sample_bilinear(maps["diffuse_albedo"], uv[nearest])
         gloss = float(np.median(sample_bilinear(maps["specular_intensity"], uv)))
-        return Material(albedo, gloss, float(np.median(sample_bilinear(maps["roughness"], uv))))
+        roughness = sample_bilinear(maps["roughness"], uv).ravel()
+        varies = np.ptp(roughness) > 1e-3
+        return Material(albedo, gloss, float(np.median(roughness)), roughness[self.index] if varies else None)
 
     def render(
         self, light: np.ndarray, cameras: Sequence[Camera], moves: str = "camera", fade: bool = True

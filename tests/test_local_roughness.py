@@ -1,0 +1,58 @@
+"""Roughness around each point: found where highlights differ, kept only for a gain on held-out frames."""
+
+import numpy as np
+import pytest
+from toy_capture import ROUGHNESS, SPECULAR, make_truth, true_albedo, true_light
+
+from shared.envmap import cube_directions
+from shared.solve import local_roughness as module
+from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.local_roughness import GlossEquations, local_roughness
+
+LOGS = np.log(ROUGHNESS) + np.log(module.FACTOR) * np.arange(-module.STEPS, module.STEPS + 1)
+
+
+def solver_under_true_light(capture):
+    """All unknowns but the roughness as they are."""
+    solver = AppearanceSolver(capture, Settings(resolutions=(16,), noise=(0.003, 0.01), roughness=ROUGHNESS))
+    solver.state.params, solver.state.specular = np.log(true_light(cube_directions(16))), SPECULAR
+    solver.state.node_albedo = true_albedo(capture.nodes.points.positions)
+    solver.state.albedo = true_albedo(capture.points.positions)
+    return solver
+
+
+def glossy_forehead(positions):
+    """A third less rough above the eyes, a third rougher below, the same on average over all points."""
+    return np.where(positions[:, 1] > np.median(positions[:, 1]), 0.8, 1.25) * ROUGHNESS
+
+
+def test_a_glossy_half_is_found_and_kept():
+    capture, _, _ = make_truth(roughness_at=glossy_forehead)
+    equations, record = local_roughness(solver_under_true_light(capture))
+    assert record["chosen"] == "local"
+    height = capture.points.positions[:, 1]
+    found = equations.roughness(capture.points.positions)
+    upper, lower = found[height > np.quantile(height, 0.65)], found[height < np.quantile(height, 0.35)]
+    assert np.median(upper) < 0.93 * ROUGHNESS < 1.07 * ROUGHNESS < np.median(lower)
+    assert np.exp(np.log(found).mean()) == pytest.approx(ROUGHNESS, rel=0.02)
+
+
+def test_one_roughness_everywhere_stays_one():
+    capture, _, _ = make_truth()
+    equations, record = local_roughness(solver_under_true_light(capture))
+    assert equations is None
+    assert record["chosen"] == "one" and record["held_out"]["one"] > 0
+
+
+def test_far_from_any_highlight_the_clips_value_stands():
+    """One point whose samples say half a step down: around it that, further away the prior."""
+    moment = np.full((len(LOGS), 1), 100.0)
+    moment[module.STEPS - 1] += 40.0
+    equations = GlossEquations(np.zeros((1, 3)), LOGS, np.full((len(LOGS), 1), 100.0), moment, (SPECULAR, 30.0))
+    at = np.array([[0.0, 0, 0], [0.7 * module.REACH * module.WIDTH_MM, 0, 0], [200.0, 0, 0]])
+    near, fading, far = equations.roughness(at)
+    assert near < fading < far
+    assert far == pytest.approx(ROUGHNESS)
+    shifted = equations.centred()
+    assert shifted.roughness(at[:1])[0] == pytest.approx(ROUGHNESS, rel=1e-3)
+    assert shifted.roughness(at[2:])[0] == pytest.approx(ROUGHNESS)
