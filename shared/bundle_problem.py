@@ -2,7 +2,8 @@
 
 Every Jacobian passes through the point in camera axes, so that an observation is worth one 3 x 3 matrix J^T W J and one
 3-vector; the blocks of cameras, points and their coupling follow from these by rotations and levers. Every point is
-seen in most frames, so the reduced camera system is dense, and one matrix product builds it.
+seen in most frames, so the reduced camera system is dense, and one matrix product builds it. Inside, components come
+first, [3, 3, F, n]: products of small matrices then run along frames and points, ten times faster than one by one.
 
 Reference: Triggs et al., Bundle adjustment - a modern synthesis, 2000, sections 3.3 (robust cost), 6.1 (elimination).
 """
@@ -62,7 +63,7 @@ class State:
 class Blocks:
     """What some points add to the normal equations.
 
-    cameras [F, 6, 6], camera_rhs [F, 6]; points [n, 3, 3], point_rhs [n, 3]; mixed [n, F, 6, 3]; the focal length's own
+    cameras [F, 6, 6], camera_rhs [F, 6]; points [n, 3, 3], point_rhs [n, 3]; mixed [6, 3, F, n]; the focal length's own
     entries, with the cameras [F, 6] and with the points [n, 3].
     """
 
@@ -111,8 +112,8 @@ class BundleProblem:
         self.anchor, self.intrinsics, self.loss_scale = np.array(anchor, np.float64), intrinsics, loss_scale
         self.motion, self.refine_focal = motion, refine_focal
         self.unknowns = 6 * len(tracks.pixels) + int(refine_focal)
-        self._pixels = np.where(self.seen[..., None], tracks.pixels, 0.0)
-        self._whitening = tracks.whitening
+        self._pixels = np.moveaxis(np.where(self.seen[..., None], tracks.pixels, 0.0), -1, 0).copy()
+        self._whitening = np.moveaxis(tracks.whitening, (2, 3), (0, 1)).copy()
         self._anchor_weight = np.maximum(self.seen.sum(0), 1) / prior_mm**2 + 1e-9
 
     def chunks(self):
@@ -129,14 +130,14 @@ class BundleProblem:
         return float(total + (0.0 if self.motion is None else self.motion.cost(state.poses)))
 
     def _residuals(self, state, chunk) -> tuple[np.ndarray, ...]:
-        """Whitened residuals [F, n, 2], Cauchy weights [F, n], points turned into camera axes, and in the camera."""
-        turned = state.points[chunk] @ np.swapaxes(state.poses[:, :3, :3], 1, 2)
-        in_camera = turned + state.poses[:, None, :3, 3]
-        error = in_camera[..., :2] / in_camera[..., 2:] * self._focal(state) + self.intrinsics[:2, 2]
-        error -= self._pixels[:, chunk]
-        whitening = self._whitening[:, chunk]
-        residual = whitening[..., 0] * error[..., :1] + whitening[..., 1] * error[..., 1:]
-        squared = (residual**2).sum(-1) / self.loss_scale**2
+        """Whitened residuals [2, F, n], Cauchy weights [F, n], points turned into camera axes, and in the camera."""
+        turned = state.poses[:, :3, :3].transpose(1, 0, 2) @ state.points[chunk].T
+        in_camera = turned + state.poses[:, :3, 3].T[..., None]
+        error = in_camera[:2] / in_camera[2] * self._focal(state)[:, None, None] + self.intrinsics[:2, 2, None, None]
+        error -= self._pixels[..., chunk]
+        whitening = self._whitening[..., chunk]
+        residual = whitening[:, 0] * error[0] + whitening[:, 1] * error[1]
+        squared = (residual**2).sum(0) / self.loss_scale**2
         return residual, np.where(self.seen[:, chunk], 1.0 / (1.0 + squared), 0.0), turned, in_camera
 
     def _focal(self, state) -> np.ndarray:
@@ -145,38 +146,36 @@ class BundleProblem:
     def linearised(self, state: State, chunk: slice) -> Blocks:
         """Normal equations of the points in one chunk."""
         residual, weight, turned, in_camera = self._residuals(state, chunk)
-        x, y, z = np.moveaxis(in_camera, -1, 0)
-        focal, whitening = self._focal(state), self._whitening[:, chunk]
-        by_x, by_y = whitening[..., 0] * (focal[0] / z)[..., None], whitening[..., 1] * (focal[1] / z)[..., None]
-        by_z = -(by_x * (x / z)[..., None] + by_y * (y / z)[..., None])
-        jacobian = np.stack([by_x, by_y, by_z], axis=-1)
-        weighted = jacobian * weight[..., None, None]
-        inner = np.swapaxes(weighted, -1, -2) @ jacobian
-        pull = -(weighted * residual[..., None]).sum(-2)
-        rotation, lever = state.poses[:, None, :3, :3], _cross_matrix(turned)
-        lever_inner, by_point = lever @ inner, inner @ rotation
-        cameras = np.empty((len(inner), 6, 6))
-        cameras[:, :3, :3] = -(lever_inner @ lever).sum(1)
-        cameras[:, :3, 3:] = lever_inner.sum(1)
+        x, y, z = in_camera
+        focal, whitening = self._focal(state), self._whitening[..., chunk]
+        by_x, by_y = whitening[:, 0] * (focal[0] / z), whitening[:, 1] * (focal[1] / z)
+        jacobian = np.stack([by_x, by_y, -(by_x * (x / z) + by_y * (y / z))])
+        weighted = jacobian * weight
+        inner = np.einsum("aifn,bifn->abfn", weighted, jacobian)
+        pull = -np.einsum("aifn,ifn->afn", weighted, residual)
+        rotation = state.poses[:, :3, :3].transpose(1, 2, 0).copy()
+        lever_inner, by_point = _cross(turned, inner), np.einsum("abfn,bcf->acfn", inner, rotation)
+        cameras = np.empty((len(weight), 6, 6))
+        cameras[:, :3, :3] = _cross(turned, lever_inner.swapaxes(0, 1)).sum(-1).transpose(2, 1, 0)
+        cameras[:, :3, 3:] = lever_inner.sum(-1).transpose(2, 0, 1)
         cameras[:, 3:, :3] = np.swapaxes(cameras[:, :3, 3:], 1, 2)
-        cameras[:, 3:, 3:] = inner.sum(1)
-        points = (np.swapaxes(rotation, -1, -2) @ by_point).sum(0)
+        cameras[:, 3:, 3:] = inner.sum(-1).transpose(2, 0, 1)
+        points = np.einsum("baf,bcfn->nac", rotation, by_point)
         points[:, [0, 1, 2], [0, 1, 2]] += self._anchor_weight[chunk, None]
-        point_rhs = (pull @ state.poses[:, :3, :3]).sum(0)
+        point_rhs = np.einsum("baf,bfn->na", rotation, pull)
         point_rhs -= self._anchor_weight[chunk, None] * (state.points[chunk] - self.anchor[chunk])
         # a longer focal length moves a pixel as a point does that moves away from the axis
-        sideways = in_camera * [1.0, 1.0, 0.0]
-        growing = (inner @ sideways[..., None])[..., 0]
+        growing = np.einsum("abfn,bfn->afn", inner[:, :2], in_camera[:2])
         return Blocks(
             cameras=cameras,
-            camera_rhs=np.concatenate([np.cross(turned, pull).sum(1), pull.sum(1)], axis=1),
+            camera_rhs=np.concatenate([_cross(turned, pull).sum(-1), pull.sum(-1)]).T,
             points=points,
             point_rhs=point_rhs,
-            mixed=np.concatenate([lever @ by_point, by_point], axis=2).transpose(1, 0, 2, 3),
-            focal=float((growing * sideways).sum()),
-            focal_rhs=float((pull * sideways).sum()),
-            focal_cameras=np.concatenate([np.cross(turned, growing).sum(1), growing.sum(1)], axis=1),
-            focal_points=(growing @ state.poses[:, :3, :3]).sum(0),
+            mixed=np.concatenate([_cross(turned, by_point), by_point]),
+            focal=float((growing[:2] * in_camera[:2]).sum()),
+            focal_rhs=float((pull[:2] * in_camera[:2]).sum()),
+            focal_cameras=np.concatenate([_cross(turned, growing).sum(-1), growing.sum(-1)]).T,
+            focal_points=np.einsum("baf,bfn->na", rotation, growing),
         )
 
     def reduced_system(self, state: State) -> ReducedSystem:
@@ -191,7 +190,8 @@ class BundleProblem:
             block = self.linearised(state, chunk)
             half = np.linalg.cholesky(np.linalg.inv(block.points))
             columns = slice(3 * chunk.start, 3 * (chunk.start + len(half)))
-            coupling[:size, columns] = (block.mixed @ half[:, None]).transpose(1, 2, 0, 3).reshape(size, -1)
+            mixed = np.einsum("abfn,bcn->acfn", block.mixed, half.transpose(1, 2, 0).copy())
+            coupling[:size, columns] = mixed.transpose(2, 0, 3, 1).reshape(size, -1)
             half_inverse[chunk], point_rhs[chunk] = half, block.point_rhs
             cameras += block.cameras
             rhs[:size] += block.camera_rhs.ravel()
@@ -232,9 +232,7 @@ def moved(poses: np.ndarray, motion: np.ndarray) -> np.ndarray:
     return result
 
 
-def _cross_matrix(vectors: np.ndarray) -> np.ndarray:
-    """[..., 3] -> [..., 3, 3] with matrix @ x = vector x x."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    rows = ((zero, -z, y), (z, zero, -x), (-y, x, zero))
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+def _cross(vectors: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Cross products of vectors [3, F, n] with others [3, F, n], or with each column of matrices [3, C, F, n]."""
+    (x, y, z), (a, b, c) = vectors, others
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a])

@@ -17,7 +17,7 @@ from shared.contract import Job, Output, Parameter, Stage, main
 
 STAGE = Stage(
     name="track_landmarks",
-    version=3,
+    version=4,
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
     given=("landmarks", "poses"),
@@ -37,7 +37,7 @@ STAGE = Stage(
         Parameter("flow_tracks", int, 1000, "Skin points that flow follows from each.", "points", 100, 20000),
         Parameter("warp_width", float, 320.0, "Width of the face in the flow's pictures.", "px", 100.0, 2000.0),
         Parameter("fine_passes", int, 1, "Passes over the finest detail.", "", 1, 6),
-        Parameter("tracks", int, 4000, "Skin points tracked against the mean texture.", "points", 100, 20000),
+        Parameter("tracks", int, 5000, "Skin points tracked against the mean texture.", "points", 100, 20000),
         Parameter("texel", float, 1.0, "Texels of the mean texture.", "px", 0.5, 8.0),
         Parameter("window", float, 5.0, "Standard width of the windows that are matched.", "texels", 1.5, 30.0),
         Parameter("point_prior", float, 10.0, "Deviation of track points about the fitted head.", "mm", 0.01, 1000.0),

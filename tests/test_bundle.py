@@ -167,7 +167,7 @@ def test_elimination_solves_the_whole_normal_equations():
     whole[:24, 24], whole[24, 24] = block.focal_cameras.ravel(), block.focal
     for n in range(10):
         columns = slice(25 + 3 * n, 28 + 3 * n)
-        whole[:24, columns] = block.mixed[n].reshape(24, 3)
+        whole[:24, columns] = block.mixed[..., n].transpose(2, 0, 1).reshape(24, 3)
         whole[24, columns] = block.focal_points[n]
         whole[columns, columns] = block.points[n]
     whole = np.triu(whole) + np.triu(whole, 1).T
