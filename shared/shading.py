@@ -49,7 +49,8 @@ class VertexShading:
 
     index [P]: the vertices that are shaded, out of all, vertices [V, 3]; points, transfer [P]: theirs; node_transfer:
     the nodes'; light [6 n^2, 3]; directions [J, 3]; camera_from_head [F, 4, 4]; moves: "head" or "camera"; bounce:
-    count light that bounced; key_step: largest turn between two frames whose reflections are computed, radians.
+    count light that bounced; key_step: largest turn between two frames whose reflections are computed, radians; deep:
+    covered share from which on a vertex takes what the nearest one in the open has.
     """
 
     def __init__(
@@ -66,6 +67,7 @@ class VertexShading:
         moves: str,
         bounce: bool = True,
         key_step: float = KEY_STEP,
+        deep: float = DEEP,
     ):
         self.material, self.directions = material, directions
         self.points, self.transfer = points, transfer
@@ -82,7 +84,7 @@ class VertexShading:
         self._turn = turned_so_far(camera_from_head)
         self._keys = key_frames(self._turn, key_step)
         self._key_reflection: dict[int, np.ndarray] = {}
-        self._stand_in = _stand_ins(vertices, index, transfer.blocked)
+        self._stand_in = _stand_ins(vertices, index, transfer.blocked, deep)
 
     def irradiance(self, frame: int) -> np.ndarray:
         """E [V, 3] float32 over pi."""
@@ -125,9 +127,9 @@ class VertexShading:
         return self._key_reflection[frame]
 
 
-def _stand_ins(vertices: np.ndarray, index: np.ndarray, blocked: np.ndarray) -> np.ndarray:
+def _stand_ins(vertices: np.ndarray, index: np.ndarray, blocked: np.ndarray, deep: float) -> np.ndarray:
     """[V]: for each vertex the place in index of the nearest shaded vertex in the open, its own where it is one."""
-    trusted = np.nonzero(blocked < DEEP)[0]
+    trusted = np.nonzero(blocked < deep)[0]
     if len(trusted) == 0:
         trusted = np.arange(len(index))
     result = trusted[cKDTree(vertices[index[trusted]]).query(vertices)[1]]

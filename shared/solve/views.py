@@ -18,7 +18,7 @@ from shared.geometry import rigid, world_from_head
 from shared.mesh import Mesh, interpolate, normalised
 from shared.raycast import RayScene, camera_hits
 from shared.render import SurfaceMaps, render_frame
-from shared.shading import Material, VertexShading
+from shared.shading import DEEP, Material, VertexShading
 from shared.solve.capture import Sizes, face_front, set_scenery
 from shared.split_sum import SplitSum
 from shared.studio_lights import STUDIO_LIGHTS, studio_light
@@ -96,7 +96,8 @@ class HeadViews:
     """Pictures of one solved head.
 
     maps: diffuse_albedo [S, S, 3], specular_intensity [S, S], roughness [S, S]. cameras: all that will look at it, so
-    that only what they can see is traced; none: everything. progress(items, label) wraps the trace.
+    that only what they can see is traced; none: everything. progress(items, label) wraps the trace. light_resolution:
+    edge of the cubemap that lights are seen through; deep: see VertexShading; over 1 where cavities are exact.
     """
 
     def __init__(
@@ -106,7 +107,10 @@ class HeadViews:
         sizes: Sizes | None = None,
         cameras: Sequence[Camera] = (),
         progress: Callable | None = None,
+        light_resolution: int = LIGHT_RESOLUTION,
+        deep: float = DEEP,
     ):
+        self.light_resolution, self.deep = light_resolution, deep
         self.viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
         self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"])
         self.scenery = set_scenery(self.viewer, sizes or Sizes())
@@ -148,11 +152,12 @@ class HeadViews:
             self.transfer,
             self.scenery.node_transfer,
             self.material,
-            np.maximum(cube_from_latlong(light, LIGHT_RESOLUTION), 0.0),
+            np.maximum(cube_from_latlong(light, self.light_resolution), 0.0),
             self.scenery.directions,
             poses,
             moves,
             key_step=0.0,
+            deep=self.deep,
         )
         pictures = []
         for k, camera in enumerate(cameras):
@@ -161,6 +166,16 @@ class HeadViews:
             )
             pictures.append(picture * covered[..., None] if fade else picture)
         return pictures
+
+    def coverage(self, camera: Camera, samples: int = 2) -> np.ndarray:
+        """[h, w] in 0 .. 1: how much of each pixel the head covers, as render counts it."""
+        covered = np.zeros(camera.size[::-1])
+        for row in range(samples):
+            for column in range(samples):
+                offsets = (column + 0.5) / samples, (row + 0.5) / samples
+                pose, lens = camera.camera_from_head, camera.intrinsics
+                covered += camera_hits(self.viewer.scene, pose, lens, *camera.size, offsets)[0] >= 0
+        return covered / samples**2
 
     def visibility(self, camera: Camera, roughness: float) -> np.ndarray:
         """[h, w]: share of a lobe of this roughness about the reflected direction that the head leaves open; NaN beside
