@@ -76,6 +76,14 @@ def _texel_across_borders(face: np.ndarray, column: np.ndarray, row: np.ndarray,
     return index
 
 
+def padded_cube_index(resolution: int) -> np.ndarray:
+    """[6 (n + 2)^2] the texel at each place of faces with a border of one texel: the neighbour's nearest."""
+    n = resolution
+    position = np.arange(-1, n + 1)
+    face, row, column = (x.ravel() for x in np.meshgrid(np.arange(6), position, position, indexing="ij"))
+    return _texel_across_borders(face, column, row, n)
+
+
 def cube_lookup(directions: np.ndarray, resolution: int) -> sparse.csr_matrix:
     """Bilinear look-up: [M, 3] unit directions -> [M, 6 n^2] matrix whose rows sum to 1.
 

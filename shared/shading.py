@@ -29,6 +29,9 @@ DEEP = 0.9
 """Cosine-weighted share of the hemisphere that the head itself covers, from which on a point counts as in a cavity."""
 
 
+LARGEST_SHARE = 0.95
+
+
 @dataclass(frozen=True)
 class Material:
     """What shading needs to know of the surface: for bounces node_albedo [K, 3], mean specular_intensity and roughness;
@@ -40,8 +43,10 @@ class Material:
     local_roughness: np.ndarray | None = None
 
     def bounce_albedo(self) -> np.ndarray:
-        """[K, 3] fraction of light that a node sends on, its specular share included as if it were diffuse."""
-        return self.node_albedo + self.specular_intensity * hemispherical_albedo(round(self.roughness, 3))
+        """[K, 3] fraction of light that a node sends on, its specular share included as if it were diffuse; under 1 for
+        materials that no skin has, too."""
+        share = self.node_albedo + self.specular_intensity * hemispherical_albedo(round(self.roughness, 3))
+        return np.minimum(share, LARGEST_SHARE)
 
 
 class VertexShading:

@@ -7,6 +7,7 @@ Method   In head space a surface point's view of the sphere never changes, so vi
          roughness by line search, stopping on held-out frames; then albedo and specular intensity per texel in closed
          form, streaming over the frames. The solver starts from a uniform light and the priors: it needs no start
          from init_albedo, which is an input for comparison only.
+         Or (solver=reference) as published: shared/solve/reference.py.
 Fails    poses that match no frame; too little of the face seen; results that are not finite.
 """
 
@@ -15,6 +16,7 @@ from __future__ import annotations
 from shared.contract import Job, Output, Parameter, Stage, main
 from shared.errors import LimnError
 
+SOLVERS = ("transfer", "reference")
 LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 STAGE = Stage(
@@ -62,17 +64,43 @@ STAGE = Stage(
                   file=True),
         Parameter("poses", str, "", "Poses (.npz: camera_from_head, perhaps frame_index) to use; empty: tracked.",
                   file=True),
+        Parameter("fit_frames", int, 0, "Fit this many frames only, chosen to cover the face; 0: all but those held "
+                  "out.", "frames", 0, 1000),
+        Parameter("solver", str, "transfer", "How: precomputed transfer in closed form, or the published stochastic "
+                  "descent, a yardstick with the reference_ parameters; it counts no bounces.", choices=SOLVERS),
+        Parameter("reference_iterations", int, 6000, "Iterations, one frame each.", "", 1, 1_000_000),
+        Parameter("reference_pixels", int, 0, "Pixels per iteration, drawn at random; 0: all.", "px", 0, 10**8),
+        Parameter("reference_light_samples", int, 256, "Samples of the diffuse integral by the light.", "", 1, 4096),
+        Parameter("reference_cosine_samples", int, 256, "Samples of the diffuse integral by the cosine.", "", 1, 4096),
+        Parameter("reference_lobe_samples", int, 64, "Samples of the highlights' visibility.", "", 1, 4096),
+        Parameter("reference_light_resolution", int, 256, "Edge of the light's cubemap faces; mips go down to 8.",
+                  "texels", choices=(8, 16, 32, 64, 128, 256, 512)),
+        Parameter("reference_vertices", bool, True, "Let the vertices move."),
+        Parameter("reference_vertex_rate", float, 0.1, "Adam's rate for vertices.", "mm", 0.0, 100.0),
+        Parameter("reference_light_rate", float, 0.1, "Adam's rate for the light.", "", 0.0, 100.0),
+        Parameter("reference_texture_rate", float, 0.001, "Adam's rate for textures.", "", 0.0, 1.0),
+        Parameter("reference_smoothing", float, 19.0, "Lambda of the large steps in shape.", "", 0.0, 1e6),
+        Parameter("reference_mask", float, 0.1, "Weight of the mask's loss.", "", 0.0, 1e6),
+        Parameter("reference_laplacian", float, 10.0, "Weight of the vertices' Laplacian.", "", 0.0, 1e6),
+        Parameter("reference_white_light", float, 0.1, "Weight of the light's deviation from grey.", "", 0.0, 1e6),
+        Parameter("reference_roughness_variation", float, 0.1, "Weight of the roughness's variation.", "", 0.0, 1e6),
+        Parameter("reference_diffuse", float, 0.01, "Weight of the squared diffuse albedo.", "", 0.0, 1e6),
+        Parameter("reference_device", str, "cpu", "Where torch computes; rays are traced on the CPU.",
+                  choices=("cpu", "cuda")),
+        Parameter("reference_checkpoint_every", int, 100, "Iterations between checkpoints, from which a run that "
+                  "was cut off goes on.", "", 1, 1_000_000),
     ),
 )
 
+CHECKPOINT = "inverse_render.checkpoint.npz"
 LATLONG_HEIGHT = 128
 SPECULAR_SPREAD = 0.25
 """Standard deviation of the logarithm of people's mean specular intensity about the expected one."""
 FLAT_NORMALS = "flat: this version solves no fine normals"
 
 
-def read_settings(job: Job):
-    """The stage's parameters as the solver's settings."""
+def read_settings(job: Job, checkpoint=None):
+    """The stage's parameters as the solver's settings; checkpoint: the reference solver's own file, or None."""
     from shared.solve.appearance import Settings
     from shared.solve.capture import Sizes
     from shared.solve.inverse import InverseSettings
@@ -100,6 +128,35 @@ def read_settings(job: Job):
         light_frames=params.light_frames,
         map_size=params.map_size,
         hold_out_every=params.hold_out_every,
+        fit_frames=params.fit_frames,
+        reference=read_reference(job, checkpoint) if params.solver == "reference" else None,
+    )
+
+
+def read_reference(job: Job, checkpoint):
+    """The reference solver's settings; InputError where the device is absent."""
+    import torch
+
+    from shared.errors import InputError
+    from shared.solve.reference_settings import ReferenceSettings, Weights
+    from shared.solve.reference_shade import Sampling
+
+    params = job.params
+    own = {name.removeprefix("reference_"): value for name, value in params.as_dict().items() if "reference_" in name}
+    if own["device"] == "cuda" and not torch.cuda.is_available():
+        raise InputError("no such device here", where="--set inverse_render.reference_device", got="cuda",
+                         mend="take cpu, or a machine and a build of torch with CUDA")
+    samples = {name: own.pop(f"{name}_samples") for name in ("light", "cosine", "lobe")}
+    weights = {name: own.pop(name) for name in ("mask", "laplacian", "white_light", "roughness_variation", "diffuse")}
+    return ReferenceSettings(
+        sampling=Sampling(**samples, visibility=params.visibility, specular=params.specular),
+        weights=Weights(**weights),
+        resolution=own.pop("light_resolution"),
+        roughness=params.roughness,
+        light_model=params.light_model,
+        seed=params.seed,
+        checkpoint=checkpoint,
+        **own,
     )
 
 
@@ -143,13 +200,14 @@ def run(job: Job) -> None:
     folders = job.input("sample_frames"), job.input("track_landmarks")
     inputs, frames, frame_index = read_inputs(*folders, job.params.mesh, job.params.poses)
     sights = inputs.chart_sights() if job.params.chart else ()
-    result = solve_clip(inputs, read_settings(job), job.progress, job.note, sights)
+    settings = read_settings(job, job.out.parent / CHECKPOINT)
+    result = solve_clip(inputs, settings, job.progress, job.note, sights)
     record = summarise(inputs, result, frame_index)
     for text in record["warnings"]:
         job.warn(text)
     write_maps(job, result)
     extra = {} if inputs.face_segment is None else {"face_segment": inputs.face_segment}
-    save_mesh(job.out / "mesh.npz", inputs.mesh, **extra)
+    save_mesh(job.out / "mesh.npz", result.viewer.mesh, **extra)
     save_arrays(
         job.out / "poses.npz",
         camera_from_head=inputs.camera_from_head,

@@ -178,7 +178,7 @@ def test_parameters_come_from_defaults_step_preset_and_call(tmp_path):
 def test_the_real_pipeline_is_sound():
     pipeline = load_pipeline()
     pipeline.check()
-    assert set(pipeline.presets) == {"draft", "standard", "fine"}
+    assert set(pipeline.presets) == {"draft", "standard", "fine", "reference"}
     assert pipeline.default_preset == "standard"
 
 

@@ -105,7 +105,9 @@ def build_capture(
     front = allowed & face_front(viewer, camera_from_head, 0.2)
     index = spread_vertices(viewer.mesh.vertices, count, front)
     samples = gather_samples(viewer, index, pictures, camera_from_head, intrinsics)
-    seen = (samples.weight[:, fitted] > 0).sum(1) >= min(MINIMUM_FRAMES, int(fitted.sum()))
+    # Of very few frames, chosen to cover the face, no point is seen in all.
+    least = min(MINIMUM_FRAMES, -(-2 * int(fitted.sum()) // 3))
+    seen = (samples.weight[:, fitted] > 0).sum(1) >= least
     points = mesh_points(viewer.mesh, index[seen])
     transfer = scenery.trace(points, progress)
     shallow = np.nonzero(transfer.blocked < DEEP)[0]

@@ -25,6 +25,8 @@ from shared.solve.capture import (
 )
 from shared.solve.chart_scale import describe_scale, doubt_scale, state_chart
 from shared.solve.fit_appearance import Solution, fit_appearance
+from shared.solve.frame_choice import covering_frames
+from shared.solve.reference_settings import ReferenceSettings
 from shared.solve.texture import PRIOR_SPREAD, TexelMaterial
 from shared.solve.texture_pass import Clip, TexturePass
 from shared.texels import TexelSurface
@@ -55,13 +57,18 @@ class InverseInputs(Protocol):
 
 @dataclass(frozen=True)
 class InverseSettings:
-    """sizes of the light's problem, its settings, frames it is solved from, edge of the maps, hold-out period."""
+    """sizes of the light's problem, its settings, frames it is solved from, edge of the maps, hold-out period.
+
+    fit_frames: how many frames to fit, chosen to cover the face, 0: all but those held out; reference: solve by the
+    published algorithm instead."""
 
     sizes: Sizes = field(default_factory=Sizes)
     appearance: Settings = field(default_factory=Settings)
     light_frames: int = 48
     map_size: int = 1024
     hold_out_every: int = 8
+    fit_frames: int = 0
+    reference: ReferenceSettings | None = None
 
 
 @dataclass(frozen=True)
@@ -88,8 +95,12 @@ def solve_clip(
     """The whole of it. progress(items, label) wraps loops, note(text) logs a line; sights: of a colour chart in view.
     """
     viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
+    fitted = frames_to_fit(inputs, settings, viewer)
+    if settings.reference is not None:
+        from shared.solve.reference_clip import solve_by_reference
+
+        return solve_by_reference(inputs, settings, settings.reference, fitted, progress, note)
     scenery = set_scenery(viewer, settings.sizes, settings.appearance.visibility)
-    fitted = hold_out(len(inputs.camera_from_head), settings.hold_out_every)
     moves = settings.appearance.light_moves(inputs.moves)
     chart, warning = state_chart(sights, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves)
     solution = _solve_light(inputs, settings, viewer, scenery, fitted, chart, progress, note)
@@ -108,6 +119,16 @@ def solve_clip(
     return InverseResult(solution, material, maps, shading, viewer, fitted, record)
 
 
+def frames_to_fit(inputs: InverseInputs, settings: InverseSettings, viewer: SurfaceViewer) -> np.ndarray:
+    """[F] bool: all frames but those held out, or the few that cover the face."""
+    poses = inputs.camera_from_head
+    if not settings.fit_frames:
+        return hold_out(len(poses), settings.hold_out_every)
+    skin = segment_vertices(inputs, FACE_SKIN)
+    chosen = covering_frames(viewer, skin, poses, inputs.intrinsics, inputs.size, settings.fit_frames)
+    return np.isin(np.arange(len(poses)), chosen)
+
+
 def segment_vertices(inputs: InverseInputs, names: tuple[str, ...]) -> np.ndarray:
     """[V] bool: vertices of faces in the named segments; all of them where the mesh has no segments."""
     if inputs.face_segment is None:
@@ -120,6 +141,8 @@ def segment_vertices(inputs: InverseInputs, names: tuple[str, ...]) -> np.ndarra
 
 def _solve_light(inputs, settings, viewer, scenery: Scenery, fitted, chart, progress, note) -> Solution:
     chosen = spread_frames(len(inputs.camera_from_head), settings.light_frames)
+    if settings.fit_frames:
+        chosen = np.union1d(chosen, np.nonzero(fitted)[0])
     # The light's own frames need held-out ones too: where thinning left too few, hold out among the thinned.
     kept = fitted[chosen] if (~fitted[chosen]).sum() >= 2 else hold_out(len(chosen), settings.hold_out_every)
     skin = segment_vertices(inputs, FACE_SKIN)

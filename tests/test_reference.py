@@ -1,0 +1,256 @@
+"""The reference solver on a small clip whose truth is known: it descends, resumes, takes its settings."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+import torch
+from toy_head import toy_head
+
+from shared.color import encode_srgb
+from shared.contract.job import Parameters
+from shared.envmap import cube_directions, latlong_from_cube
+from shared.errors import InputError
+from shared.gather import SurfaceViewer, prepare_picture
+from shared.geometry import rigid, rotation_from_vector
+from shared.mesh import Mesh
+from shared.raycast import RayScene
+from shared.solve.capture import Sizes
+from shared.solve.frame_choice import covering_frames
+from shared.solve.inverse import InverseSettings, frames_to_fit, solve_clip, summarise
+from shared.solve.reference import ReferenceSolver
+from shared.solve.reference_clip import Checkpoint
+from shared.solve.reference_settings import ReferenceSettings
+from shared.solve.reference_shade import Sampling
+from shared.solve.reference_shape import LargeSteps
+from shared.solve.views import Camera, HeadViews
+from stages.inverse_render import STAGE, read_settings
+
+FRAMES, SIZE, MAP = 9, (64, 64), 32
+LENS = np.array([[230.0, 0, 32], [0, 230.0, 32], [0, 0, 1]])
+
+
+@dataclass(frozen=True)
+class ToyClip:
+    """What the solvers read of a clip."""
+
+    mesh: Mesh
+    camera_from_head: np.ndarray
+    pictures: tuple
+    intrinsics: np.ndarray = field(default_factory=LENS.copy)
+    size: tuple[int, int] = SIZE
+    moves: str = "head"
+    face_segment: np.ndarray | None = None
+    segment_names: tuple[str, ...] = ()
+
+    def picture(self, f):
+        return self.pictures[f]
+
+
+def true_maps():
+    v, u = np.mgrid[0:MAP, 0:MAP] / MAP
+    pattern = np.exp(0.35 * np.sin(12.0 * u) * np.cos(9.0 * v))
+    albedo = (np.array([0.48, 0.30, 0.22]) * pattern[..., None]).astype(np.float32)
+    full = np.ones((MAP, MAP), np.float32)
+    return {"diffuse_albedo": albedo, "specular_intensity": 0.5 * full, "roughness": 0.45 * full}
+
+
+def true_light():
+    texels = cube_directions(16)
+    lamp = np.exp(5.0 * (texels @ np.array([-0.52, 0.43, 0.74]) - 1.0))[:, None]
+    return 0.35 + np.array([1.6, 1.5, 1.3]) * lamp + 0.1 * texels[:, 1:2]
+
+
+@pytest.fixture(scope="module")
+def clip():
+    """A turning egg, rendered by the shared renderer (no part of the reference solver)."""
+    mesh = toy_head(4).mesh(np.zeros(2), np.zeros(1))
+    angle = np.linspace(-0.6, 0.6, FRAMES)
+    vectors = np.stack([0.15 * np.sin(5 * angle), angle, 0 * angle], axis=1)
+    poses = rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors), np.tile([0.0, 0, 900.0], (FRAMES, 1)))
+    cameras = [Camera(pose, LENS, SIZE) for pose in poses]
+    views = HeadViews(mesh, true_maps(), Sizes(directions=512, nodes=60), cameras)
+    light = latlong_from_cube(true_light(), 64)
+    pictures = []
+    for camera, image in zip(cameras, views.render(light, cameras, "head", fade=False), strict=True):
+        codes = np.round(255 * encode_srgb(np.clip(image, 0, 1))).astype(np.uint8)
+        mask = (views.coverage(camera) > 0.5).astype(np.uint8) * 255
+        pictures.append(prepare_picture(codes, image.astype(np.float32), mask))
+    return ToyClip(mesh, poses, tuple(pictures))
+
+
+def settings_of(clip, **changes):
+    reference = ReferenceSettings(
+        iterations=60,
+        pixels=500,
+        sampling=Sampling(24, 24, 8),
+        resolution=8,
+        vertices=False,
+        texture_rate=0.01,
+        light_rate=0.03,
+    )
+    sizes = Sizes(points=300, directions=256, nodes=60)
+    return InverseSettings(sizes=sizes, map_size=MAP, hold_out_every=4, reference=replace(reference, **changes))
+
+
+def nothing(*arguments):
+    return arguments[0] if arguments else None
+
+
+def albedo_error(maps, seen):
+    """Median relative error after the best factor per channel."""
+    ratio = maps[seen] / true_maps()["diffuse_albedo"][seen]
+    return float(np.median(np.abs(ratio / np.median(ratio, axis=0) - 1.0)))
+
+
+def test_it_finds_the_albedo(clip):
+    """From the mean texture, with the shading in it, towards the truth; the record is complete and finite."""
+    states = {}
+
+    def note(text):
+        states.setdefault("notes", []).append(text)
+
+    first = solve_clip(clip, settings_of(clip, iterations=1), nothing, note)
+    seen = first.maps["confidence"] > 0.9
+    assert 0.1 < seen.mean() < 0.8
+    result = solve_clip(clip, settings_of(clip, iterations=160), nothing, note)
+    before, after = (albedo_error(r.maps["diffuse_albedo"], seen) for r in (first, result))
+    assert after < 0.6 * before and after < 0.11
+    assert result.solution.fitted < 0.6 * first.solution.fitted
+    record = summarise(clip, result, np.arange(FRAMES))
+    assert record["held_out_frames"] == [2, 6]
+    assert np.isfinite([record["residuals"]["fitted"], record["residuals"]["held_out"]]).all()
+    assert any("iteration 160" in line for line in states["notes"])
+    assert result.shading.irradiance(0).shape == (len(clip.mesh.vertices), 3)
+
+
+def test_a_run_that_was_cut_off_goes_on_as_if_it_had_not_been(clip, tmp_path):
+    """Ten iterations, a checkpoint, ten more: the very numbers of twenty in one go. Other settings start anew."""
+    path = tmp_path / "checkpoint.npz"
+    notes = []
+    whole = solve_clip(clip, settings_of(clip, iterations=20), nothing, notes.append)
+
+    class CutOff(Exception):
+        pass
+
+    def cut(items, label=""):
+        for i, item in enumerate(items):
+            if label == "reference iterations" and i == 13:
+                raise CutOff
+            yield item
+
+    options = {"iterations": 20, "checkpoint": path, "checkpoint_every": 10}
+    with pytest.raises(CutOff):
+        solve_clip(clip, settings_of(clip, **options), cut, notes.append)
+    assert path.is_file()
+    other = settings_of(clip, **options, light_rate=0.05)
+    solve_clip(clip, other, nothing, notes.append)
+    assert any("starts anew" in text for text in notes)
+    with pytest.raises(CutOff):
+        solve_clip(clip, settings_of(clip, **options), cut, notes.append)
+    parts = solve_clip(clip, settings_of(clip, **options), nothing, notes.append)
+    assert any("goes on from iteration 10" in text for text in notes)
+    assert np.array_equal(parts.maps["diffuse_albedo"], whole.maps["diffuse_albedo"])
+    assert np.array_equal(parts.solution.state.light, whole.solution.state.light)
+    assert not path.exists()
+
+
+def test_a_damaged_checkpoint_is_passed_over(clip, tmp_path):
+    path = tmp_path / "checkpoint.npz"
+    path.write_bytes(b"PK\x03\x04 nonsense")
+    notes = []
+    solve_clip(clip, settings_of(clip, iterations=1, checkpoint=path), nothing, notes.append)
+    assert any("starts anew" in text for text in notes) and not path.exists()
+
+
+def test_vertices_move_towards_the_outline(clip):
+    """The egg 3 % too small: mask and image losses pull its outline outwards."""
+    small = replace(clip, mesh=clip.mesh.replace(vertices=clip.mesh.vertices * 0.97))
+    changes = {"vertices": True, "iterations": 40, "pixels": 300, "vertex_rate": 0.3, "sampling": Sampling(8, 8, 4)}
+    result = solve_clip(small, settings_of(small, **changes), nothing, nothing)
+    moved = result.viewer.mesh.vertices
+    rim = np.abs(clip.mesh.vertices[:, 0]) > 60.0
+    before = np.linalg.norm(small.mesh.vertices[rim] - clip.mesh.vertices[rim], axis=1).mean()
+    after = np.linalg.norm(moved[rim] - clip.mesh.vertices[rim], axis=1).mean()
+    assert after < 0.7 * before
+    assert np.isfinite(moved).all()
+
+
+@pytest.mark.parametrize("model", ["harmonics_2", "sun_sky", "camera"])
+def test_light_models_are_those_of_the_transfer_solver(clip, model):
+    """Few parameters drawn into a cubemap; the residual falls through them, least where a lamp is misplaced.
+    """
+    sampling = Sampling(16, 16, 8, visibility=model == "sun_sky")
+    first, last = (
+        solve_clip(clip, settings_of(clip, light_model=model, iterations=count, sampling=sampling), nothing, nothing)
+        for count in (1, 45)
+    )
+    assert last.solution.fitted < (0.95 if model == "camera" else 0.85) * first.solution.fitted
+    assert last.solution.state.light.min() > 0.0 and np.ptp(last.solution.state.light) > 0.05
+
+
+def test_large_steps_are_a_change_of_variables(clip):
+    mesh = clip.mesh
+    steps = LargeSteps(mesh.faces, len(mesh.vertices), 19.0)
+    parameters = torch.from_numpy(steps.parameters(mesh.vertices))
+    assert np.allclose(steps.vertices(parameters).numpy(), mesh.vertices)
+    spike = torch.zeros_like(parameters)
+    spike[100, 0] = 1.0
+    smooth = steps.vertices(spike).numpy()[:, 0]
+    assert smooth.sum() == pytest.approx(1.0, rel=1e-6) and smooth.max() < 0.05 and smooth.argmax() == 100
+
+
+def test_few_frames_cover_the_face(clip):
+    """Three of nine: one from either side and one between; they alone are fitted, the others judge."""
+    viewer = SurfaceViewer(clip.mesh, RayScene(clip.mesh.vertices, clip.mesh.faces))
+    front = clip.mesh.vertices[:, 2] > 10.0
+    chosen = covering_frames(viewer, front, clip.camera_from_head, LENS, SIZE, 3)
+    assert len(set(chosen.tolist())) == 3 and chosen[0] <= 1 and chosen[-1] >= FRAMES - 2
+    fitted = frames_to_fit(clip, InverseSettings(fit_frames=3), viewer)
+    assert fitted.sum() == 3 and len(fitted) == FRAMES
+
+
+class _Job:
+    def __init__(self, **changes):
+        self.params = Parameters({**STAGE.defaults(), **STAGE.parse(changes, "test")})
+
+
+def test_the_stage_hands_its_parameters_on():
+    """The declaration's defaults are the published numbers; other values arrive where they belong."""
+    published = read_settings(_Job(solver="reference", roughness=0.45)).reference
+    assert replace(published, roughness=0.45) == ReferenceSettings()
+    changed = read_settings(
+        _Job(
+            solver="reference",
+            reference_light_samples=32,
+            reference_mask=0.5,
+            visibility=False,
+            specular=False,
+            light_model="sun_sky",
+            reference_pixels=100,
+        )
+    ).reference
+    assert changed.sampling == Sampling(32, 256, 64, visibility=False, specular=False)
+    assert (changed.weights.mask, changed.light_model, changed.pixels) == (0.5, "sun_sky", 100)
+    assert read_settings(_Job()).reference is None
+    if not torch.cuda.is_available():
+        with pytest.raises(InputError, match="reference_device"):
+            read_settings(_Job(solver="reference", reference_device="cuda"))
+
+
+def test_checkpoints_know_what_they_belong_to(clip):
+    solver_settings = settings_of(clip).reference
+    from shared.solve.reference import Start, Views
+
+    maps = true_maps()
+    start = Start(np.ones(3), maps["diffuse_albedo"], maps["specular_intensity"])
+    views = Views(clip.picture, clip.camera_from_head, LENS, SIZE, "head")
+    key = Checkpoint(solver_settings, start, views).key
+    assert np.array_equal(key, Checkpoint(replace(solver_settings, iterations=999), start, views).key)
+    assert not np.array_equal(key, Checkpoint(replace(solver_settings, seed=1), start, views).key)
+    assert not np.array_equal(key, Checkpoint(solver_settings, replace(start, radiance=2 * np.ones(3)), views).key)
+    solver = ReferenceSolver(clip.mesh, views, start, solver_settings)
+    solver.step()
+    again = ReferenceSolver(clip.mesh, views, start, solver_settings)
+    again.restore(solver.arrays())
+    assert solver.step() == again.step()
