@@ -5,7 +5,8 @@
 
 Runs sample_frames and track_landmarks on each subject as it is, and with --spoil on the spoilt copies of the first
 (tools/perturb.py) as well. Writes DIR/tracking.csv and tracking.md. Rotations are compared after one common turn of
-the head, so that the mesh does not enter. `covered`: share of frames whose true rotation error lies within the 90 %
+the head, so that the mesh does not enter; the head's place across the view and in depth after the mesh's alignment, as
+tools.score does. `covered`: share of frames whose true rotation error lies within the 90 %
 region of the reported covariance. With --backwards no truth is needed: each clip is tracked from its first frame and
 from its last, and DIR/backwards.csv and .md say how far the poses are apart.
 """
@@ -22,7 +23,6 @@ from pathlib import Path
 import numpy as np
 
 from shared.errors import InputError
-from shared.geometry import camera_centres, similarity_from_points
 from shared.io.arrays import load_arrays, read_json
 from shared.io.meshes import load_mesh
 from shared.solve.pose_trust import rotations_apart
@@ -60,10 +60,10 @@ def measure(subject: Path, work: Path) -> dict[str, object]:
     angle = np.degrees(np.linalg.norm(apart, axis=1))
     rotation_covariance = found["covariance"][:, :3, :3]
     distance = np.einsum("fi,fi->f", apart, np.linalg.solve(rotation_covariance, apart[..., None])[..., 0])
-    scale, turn, shift = similarity_from_points(camera_centres(poses), camera_centres(true))
-    apart_mm = scale * camera_centres(poses) @ turn.T + shift - camera_centres(true)
-    off = np.einsum("fij,fj->fi", true[:, :3, :3], apart_mm)
-    _, geometry = score_geometry(subject, load_mesh(tracked / "mesh.npz"), true, poses, np.random.default_rng(0))
+    alignment, geometry = score_geometry(
+        subject, load_mesh(tracked / "mesh.npz"), true, poses, np.random.default_rng(0)
+    )
+    off = np.stack([alignment.pose(pose) for pose in poses])[:, :3, 3] - true[:, :3, 3]
     return {
         "frames": len(poses),
         "excluded": len(record["excluded"]),

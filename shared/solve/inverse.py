@@ -111,7 +111,8 @@ def solve_clip(
     texture = TexturePass(surface, viewer, shading, clip, solution.state.specular, typical, progress=progress)
     widths = (np.inf, settings.map_size / 16, settings.map_size / 64) if settings.appearance.specular else (np.inf,)
     material, texture_record = texture.run(widths)
-    roughness = vertex_roughness(solution, inputs.mesh.vertices)
+    gloss = solution.gloss
+    roughness = solution.state.roughness if gloss is None else gloss.roughness(inputs.mesh.vertices)
     maps = make_maps(surface, material, roughness)
     skin = np.median(solution.state.albedo, axis=0)
     warnings = [*[warning] * bool(warning), *doubt_scale(chart, skin)]
@@ -201,22 +202,16 @@ def shade_vertices(
     )
 
 
-def vertex_roughness(solution: Solution, vertices: np.ndarray) -> np.ndarray:
-    """[V] at vertices [V, 3] mm."""
-    if solution.gloss is None:
-        return np.full(len(vertices), solution.state.roughness)
-    return solution.gloss.roughness(vertices)
-
-
-def make_maps(surface: TexelSurface, material: TexelMaterial, roughness: np.ndarray) -> dict[str, np.ndarray]:
-    """UV-space images with filled gutters; roughness [V] of the vertices; confidence is the share of the prior's
+def make_maps(surface: TexelSurface, material: TexelMaterial, roughness: float | np.ndarray) -> dict[str, np.ndarray]:
+    """UV-space images with filled gutters; roughness: one, or each vertex's [V]; confidence is the share of the prior's
     variance that the clip removed."""
     confidence = PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + 1.0 / np.maximum(material.information, 1e-9))
     size = (surface.size, surface.size)
+    at_vertices = np.broadcast_to(np.asarray(roughness), len(surface.mesh.vertices))[:, None]
     return {
         "diffuse_albedo": surface.dilated(surface.to_image(material.albedo.astype(np.float32))),
         "specular_intensity": surface.dilated(surface.to_image(material.specular.astype(np.float32))),
-        "roughness": surface.dilated(surface.to_image(surface.interpolate(roughness[:, None])[:, 0])),
+        "roughness": surface.dilated(surface.to_image(surface.interpolate(at_vertices)[:, 0])),
         "normal": np.broadcast_to(np.array([0.5, 0.5, 1.0], np.float32), size + (3,)).copy(),
         "confidence": surface.to_image(confidence.astype(np.float32)),
     }
