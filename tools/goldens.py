@@ -2,7 +2,8 @@
 
     python -m tools.goldens [STAGE ...]     runs the tiny subject and rewrites tests/golden/<stage>.json
 
-A golden file changes only on purpose, together with its stage's version, with the reason in the commit. Images are kept
+A golden file changes only on purpose, together with its stage's version or an earlier stage's, with the reason in the
+commit. Images are kept
 as a coarse grid of block means, arrays as evenly spaced samples with their spread: enough to notice any change of
 result, small enough to read in a review.
 """
@@ -35,7 +36,7 @@ def stage_folder(run_folder: Path, stage: str) -> Path:
 
 
 def summarise(folder: Path, stage: str) -> dict:
-    """{file: numbers} of one stage's folder, with the version that made it."""
+    """{file: numbers} of one stage's folder, with the version that made it and those of the stages before it."""
     files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     content = {}
     for suffix, reduce in ((".exr", _image), (".png", _image), (".npz", _archive)):
@@ -44,7 +45,13 @@ def summarise(folder: Path, stage: str) -> dict:
             if len(siblings) < MOST_FILES or "maps/" in name:
                 content[name] = reduce(folder / name)
     kept = [name for name in files if not name.endswith("log.txt")]
-    return {"version": importlib.import_module(f"stages.{stage}").STAGE.version, "files": kept, "content": content}
+    before = {name: version(name) for name in STAGES[: STAGES.index(stage)]}
+    return {"version": version(stage), "before": before, "files": kept, "content": content}
+
+
+def version(stage: str) -> int:
+    """A stage's version as declared."""
+    return importlib.import_module(f"stages.{stage}").STAGE.version
 
 
 def _image(path: Path) -> dict:
@@ -92,7 +99,8 @@ def main() -> int:
             summary = summarise(stage_folder(run_folder, stage), stage)
             if target.exists():
                 old = read_json(target)
-                if old["content"] != summary["content"] and old["version"] == summary["version"]:
+                raised = any(old.get(key) != summary[key] for key in ("version", "before"))
+                if old["content"] != summary["content"] and not raised:
                     print(f"{stage}: the result changed but the stage's version is still {old['version']}: raise it")
             GOLDEN_FOLDER.mkdir(parents=True, exist_ok=True)
             write_json(target, summary)
