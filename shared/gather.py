@@ -120,7 +120,7 @@ def prepare_picture(codes: np.ndarray, linear: np.ndarray, mask: np.ndarray, bor
     return Picture(tuple(levels), limits, inside.astype(np.float32))
 
 
-def _remap(image: np.ndarray, pixels: np.ndarray, interpolation: int) -> np.ndarray:
+def remap(image: np.ndarray, pixels: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
     """image [H, W, ...] at pixels [N, 2] (first centre at 0.5) -> [N, ...]; the border is repeated."""
     count = len(pixels)
     rows = -(-count // _REMAP_COLUMNS)
@@ -137,7 +137,7 @@ def sample_colours(picture: Picture, pixels: np.ndarray, footprint: np.ndarray |
     Footprints up to one pixel are interpolated bicubically; wider ones blend the two nearest levels of the pyramid
     (trilinear), so that a coarse map is filtered instead of aliased.
     """
-    colours = np.maximum(_remap(picture.levels[0], pixels, cv2.INTER_CUBIC), 0.0)
+    colours = np.maximum(remap(picture.levels[0], pixels, cv2.INTER_CUBIC), 0.0)
     if footprint is None or float(footprint.max(initial=0.0)) <= 1.0:
         return colours
     level = np.log2(np.maximum(footprint, 1.0)).astype(np.float32)
@@ -147,7 +147,7 @@ def sample_colours(picture: Picture, pixels: np.ndarray, footprint: np.ndarray |
         if len(wide) == 0:
             break
         size = np.array(image.shape[1::-1], np.float32)
-        coarse = _remap(image, pixels[wide] * (size / full), cv2.INTER_LINEAR)
+        coarse = remap(image, pixels[wide] * (size / full), cv2.INTER_LINEAR)
         blend = np.minimum(level[wide] - k, 1.0)[:, None]
         colours[wide] += blend * (coarse - colours[wide])
     return colours
@@ -155,13 +155,13 @@ def sample_colours(picture: Picture, pixels: np.ndarray, footprint: np.ndarray |
 
 def sample_limits(picture: Picture, pixels: np.ndarray) -> np.ndarray:
     """[N, 2] -> int8 [N, 3]: +1 or -1 where a pixel that the sample reads is clipped or crushed."""
-    found = _remap(picture.limits.astype(np.float32), pixels, cv2.INTER_LINEAR)
+    found = remap(picture.limits.astype(np.float32), pixels, cv2.INTER_LINEAR)
     return (found > 0.1).astype(np.int8) - (found < -0.5).astype(np.int8)
 
 
 def sample_inside(picture: Picture, pixels: np.ndarray) -> np.ndarray:
     """[N, 2] -> [N] float32 trust by distance from the mask's border, 0 outside."""
-    return _remap(picture.inside, pixels, cv2.INTER_LINEAR)
+    return remap(picture.inside, pixels, cv2.INTER_LINEAR)
 
 
 def gather_samples(

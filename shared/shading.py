@@ -84,20 +84,20 @@ class VertexShading:
         total = irradiance(transfer, flat, radiosity) if bounce else direct
         self._irradiance = total.reshape(shape).astype(np.float16)
         self._bounced = (total - direct).reshape(shape).astype(np.float16)
-        self._table = LobeTable(points.normals, transfer.visibility(), directions)
+        self.table = LobeTable(points.normals, transfer.visibility(), directions)
         self._centres = camera_centres(camera_from_head)
         self._turn = turned_so_far(camera_from_head)
         self._keys = key_frames(self._turn, key_step)
         self._key_reflection: dict[int, np.ndarray] = {}
-        self._stand_in = _stand_ins(vertices, index, transfer.blocked, deep)
+        self.stand_in = _stand_ins(vertices, index, transfer.blocked, deep)
 
     def irradiance(self, frame: int) -> np.ndarray:
         """E [V, 3] float32 over pi."""
-        return self._irradiance[:, frame].astype(np.float32)[self._stand_in]
+        return self._irradiance[:, frame].astype(np.float32)[self.stand_in]
 
     def mean_irradiance(self) -> np.ndarray:
         """[V, 3] float32: E averaged over the frames."""
-        return self._irradiance.mean(1, dtype=np.float32)[self._stand_in]
+        return self._irradiance.mean(1, dtype=np.float32)[self.stand_in]
 
     def reflection(self, frame: int) -> np.ndarray:
         """S [V, 3] float32 at specular_intensity 1, between the two key frames around this one.
@@ -111,20 +111,35 @@ class VertexShading:
         value = self._at_key(low).astype(np.float32)
         if high != low:
             value += np.float32(share) * (self._at_key(high).astype(np.float32) - value)
-        return value[self._stand_in]
+        return value[self.stand_in]
+
+    def irradiance_of_points(self, rows: np.ndarray) -> np.ndarray:
+        """E [n, F, 3] float32 of some of the P points, each its own, in all frames."""
+        return self._irradiance[rows].astype(np.float32)
+
+    def roughness_of(self, rows: np.ndarray) -> float | np.ndarray:
+        """Of some of the P points: [n] where it varies."""
+        local = self.material.local_roughness
+        return self.material.roughness if local is None else np.maximum(local[rows], self.table.narrowest)
+
+    def towards_camera(self, frame: int) -> np.ndarray:
+        """[P, 3] unit vectors from the points to the camera."""
+        return normalised(self._centres[frame] - self.points.positions)
+
+    def blocked_light(self, frame: int) -> np.ndarray:
+        """[P, 3] float32: mean radiance of what of the head itself stands before the points."""
+        return self._bounced[:, frame].astype(np.float32) / np.maximum(self.transfer.blocked, 1e-3)[:, None]
 
     def _at_key(self, frame: int) -> np.ndarray:
         """S of the shaded vertices in one frame [P, 3], half floats; made once."""
         if frame not in self._key_reflection:
-            towards = normalised(self._centres[frame] - self.points.positions)
-            blocked = self._bounced[:, frame].astype(np.float32) / np.maximum(self.transfer.blocked, 1e-3)[:, None]
+            towards, blocked = self.towards_camera(frame), self.blocked_light(frame)
             facing = np.nonzero((towards * self.points.normals).sum(1) > -0.1)[0]
             value = np.zeros((len(self.points), 3), np.float16)
-            local = self.material.local_roughness
             value[facing] = specular_reflection(
-                self._table.take(facing),
+                self.table.take(facing),
                 towards[facing],
-                self.material.roughness if local is None else np.maximum(local[facing], self._table.narrowest),
+                self.roughness_of(facing),
                 self.light_along[:, frame],
                 blocked[facing],
             )

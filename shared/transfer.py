@@ -108,14 +108,14 @@ def _cells(points: np.ndarray, size: float) -> np.ndarray:
     return (grid[:, 0] * extent[1] + grid[:, 1]) * extent[2] + grid[:, 2]
 
 
-def _position_and_normal(points: Points) -> np.ndarray:
+def position_and_normal(points: Points) -> np.ndarray:
     """[P, 6]: nearness on the surface, so that the two sides of a thin part (an ear, a lip) stay apart."""
     return np.concatenate([points.positions, _NORMAL_MATTERS_MM * points.normals], axis=1)
 
 
 def nearest_points(target: Points, source: Points) -> np.ndarray:
     """For each target point [P] the index of the nearest source point, counting position and orientation."""
-    return cKDTree(_position_and_normal(source)).query(_position_and_normal(target))[1]
+    return cKDTree(position_and_normal(source)).query(position_and_normal(target))[1]
 
 
 def bounce_nodes(mesh: Mesh, count: int) -> Nodes:

@@ -1,12 +1,14 @@
-"""Inverse rendering: the light, and the skin's albedo, specular intensity and roughness, from the whole clip.
+"""Inverse rendering: light, shape, and the skin's albedo, specular intensity and roughness, from the whole clip.
 
-Reads    sample_frames (frames, masks), track_landmarks (poses, mesh, segments).
+Reads    sample_frames (frames, masks), track_landmarks (poses, mesh, segments, track points).
 Writes   maps/*.exr, envmap.exr, mesh.npz, poses.npz, renders/*.exr, solve.json.
 Method   In head space a surface point's view of the sphere never changes, so visibility and bounces are traced once
          and reused by all frames. Light by Gauss-Newton with the albedo eliminated, specular intensity in closed form,
-         roughness by line search, stopping on held-out frames; then albedo and specular intensity per texel in closed
-         form, streaming over the frames. The solver starts from a uniform light and the priors: it needs no start
-         from init_albedo, which is an input for comparison only.
+         roughness by line search, stopping on held-out frames. Under that light the mesh is refined from parallax and
+         shading by Gauss-Newton, coarse to fine, the light solved anew, and the refined mesh kept if held-out frames
+         fit better. Then albedo and specular intensity per texel in closed form, streaming over the frames. The solver
+         starts from a uniform light and the priors: it needs no start from init_albedo, which is an input for
+         comparison only.
          Or (solver=reference) as published: shared/solve/reference.py.
 Fails    poses that match no frame; too little of the face seen; results that are not finite.
 """
@@ -21,14 +23,14 @@ LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 STAGE = Stage(
     name="inverse_render",
-    version=4,
-    help="Light, albedo, specular intensity and roughness from the whole clip.",
+    version=5,
+    help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     outputs=(
         Output("maps/*.exr", "albedo, specular intensity, roughness, normal, confidence", space="uv",
                colour_space="in each file"),
         Output("envmap.exr", "incident radiance, lat-long", space="world", colour_space="lin_rec709_scene"),
-        Output("mesh.npz", "the head's mesh", unit="mm", space="head"),
+        Output("mesh.npz", "the refined mesh, with its face segments", unit="mm", space="head"),
         Output("poses.npz", "camera_from_head [F, 4, 4], frame_index [F], intrinsics of source and crop", unit="mm"),
         Output("renders/*.exr", "re-renders of chosen crops, 0 outside the head", space="crop",
                colour_space="lin_rec709_scene"),
@@ -59,6 +61,14 @@ STAGE = Stage(
         Parameter("light_smoothness", float, 1.0, "Weight of the light's smoothness.", "", 0.0, 1000.0),
         Parameter("evidence", float, 5000.0, "How many independent samples the clip counts as.", "", 10.0, 1e7),
         Parameter("chart", bool, True, "Take the light's scale from the colour chart that sample_frames found."),
+        Parameter("shape", bool, True, "Refine the mesh from shading, parallax and tracks."),
+        Parameter("shape_subdivisions", int, 1, "Times that the mesh is subdivided for that.", "", 0, 2),
+        Parameter("shape_rounds", int, 2, "Most steps of the shape per level.", "", 1, 20),
+        Parameter("shape_frames", int, 48, "Frames that the shape is solved from, spread evenly.", "frames", 3, 1000),
+        Parameter("shape_smoothness", float, 19.0, "Lambda of the large steps: over how many edges, squared, the "
+                  "surface moves together.", "", 0.0, 10000.0),
+        Parameter("shape_spread", float, 8.0, "Expected distance of the tracked mesh from the truth where it is wrong "
+                  "as a whole.", "mm", 0.01, 100.0),
         Parameter("render_count", int, 8, "Frames to re-render, spread evenly.", "frames", 1, 2000),
         Parameter("mesh", str, "", "Mesh (.npz or .obj) to use instead of the tracked one; empty: tracked.",
                   file=True),
@@ -105,6 +115,7 @@ def read_settings(job: Job, checkpoint=None):
     from shared.solve.capture import Sizes
     from shared.solve.inverse import InverseSettings
     from shared.solve.light import LightPriors
+    from shared.solve.shape import ShapeSettings
 
     params = job.params
     appearance = Settings(
@@ -122,12 +133,20 @@ def read_settings(job: Job, checkpoint=None):
         local_roughness=params.local_roughness,
         specular_prior=(params.specular_prior, SPECULAR_SPREAD),
     )
+    shape = ShapeSettings(
+        subdivisions=params.shape_subdivisions,
+        rounds=params.shape_rounds,
+        frames=params.shape_frames,
+        smoothness=params.shape_smoothness,
+        sigma_mm=params.shape_spread,
+    )
     return InverseSettings(
         sizes=Sizes(params.points, params.directions, params.bounce_nodes),
         appearance=appearance,
         light_frames=params.light_frames,
         map_size=params.map_size,
         hold_out_every=params.hold_out_every,
+        shape=shape if params.shape else None,
         fit_frames=params.fit_frames,
         reference=read_reference(job, checkpoint) if params.solver == "reference" else None,
     )
@@ -196,6 +215,7 @@ def run(job: Job) -> None:
     from shared.io.clip_inputs import read_inputs
     from shared.io.meshes import save_mesh
     from shared.solve.inverse import solve_clip, summarise
+    from shared.solve.reshape import segments_of
 
     folders = job.input("sample_frames"), job.input("track_landmarks")
     inputs, frames, frame_index = read_inputs(*folders, job.params.mesh, job.params.poses)
@@ -206,7 +226,8 @@ def run(job: Job) -> None:
     for text in record["warnings"]:
         job.warn(text)
     write_maps(job, result)
-    extra = {} if inputs.face_segment is None else {"face_segment": inputs.face_segment}
+    segment = segments_of(inputs, result.viewer.mesh)
+    extra = {} if segment is None else {"face_segment": segment}
     save_mesh(job.out / "mesh.npz", result.viewer.mesh, **extra)
     save_arrays(
         job.out / "poses.npz",

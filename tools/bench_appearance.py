@@ -30,7 +30,7 @@ from shared.io.arrays import load_arrays
 from shared.io.clip_inputs import ClipInputs, read_inputs
 from shared.io.images import read_exr, read_png
 from shared.io.meshes import read_obj
-from shared.mesh import interpolate
+from shared.mesh import Mesh, interpolate
 from shared.raycast import RayScene, camera_hits
 from shared.render import SurfaceMaps, render_frame
 from shared.solve.inverse import InverseResult, solve_clip
@@ -86,9 +86,11 @@ def crop_of(buffer: np.ndarray, inputs: ClipInputs) -> np.ndarray:
     return cv2.warpAffine(buffer.astype(np.float32), matrix, inputs.size, flags=cv2.INTER_LINEAR)
 
 
-def map_errors(subject: Path, inputs: ClipInputs, index: np.ndarray, maps: dict[str, np.ndarray]) -> dict:
+def map_errors(
+    subject: Path, inputs: ClipInputs, index: np.ndarray, mesh: Mesh, maps: dict[str, np.ndarray]
+) -> dict:
     """Albedo, specular intensity, roughness and the calibration of the confidence, in the frames that hold truth."""
-    viewer, pairs = BufferViewer(inputs.mesh, maps), {name: [] for name in ("albedo", "specular", "roughness")}
+    viewer, pairs = BufferViewer(mesh, maps), {name: [] for name in ("albedo", "specular", "roughness")}
     fields = {"albedo": "diffuse_albedo", "specular": "specular_intensity", "roughness": "roughness"}
     confidence = []
     place = {int(frame): i for i, frame in enumerate(index)}
@@ -193,7 +195,7 @@ def measure(subject: Path, inputs: ClipInputs, index: np.ndarray, changes: dict,
     result = solve_clip(inputs, read_settings(job), silent, note, sights)
     scores = {"seconds": time.perf_counter() - start}
     scores["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    scores |= map_errors(subject, inputs, index, result.maps)
+    scores |= map_errors(subject, inputs, index, result.viewer.mesh, result.maps)
     scores |= light_errors(subject, latlong_from_cube(result.solution.state.light, 128))
     has_relight = (subject / "relight").is_dir()
     relit = relight_errors(subject, result, settings_of(changes), inputs.camera_from_head, index) if has_relight else {}
@@ -214,7 +216,7 @@ class LargeClip:
         self.intrinsics = np.diag([self.factor, self.factor, 1.0]) @ inputs.intrinsics
         self.camera_from_head = inputs.camera_from_head[self._frame]
         self.mesh, self.moves = inputs.mesh, inputs.moves
-        self.face_segment, self.segment_names = inputs.face_segment, inputs.segment_names
+        self.face_segment, self.segment_names, self.tracks = inputs.face_segment, inputs.segment_names, inputs.tracks
 
     def picture(self, f: int) -> Picture:
         """Frame f, enlarged."""

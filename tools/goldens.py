@@ -24,7 +24,12 @@ ROOT = Path(__file__).resolve().parents[1]
 TINY_SUBJECT = ROOT / "tests" / "tiny"
 GOLDEN_FOLDER = ROOT / "tests" / "golden"
 STAGES = ("sample_frames", "track_landmarks", "init_albedo", "inverse_render", "export_usd")
-TINY_SETTINGS = ("init_albedo.size=256", "inverse_render.map_size=256")
+TINY_SETTINGS = (
+    "init_albedo.size=256",
+    "inverse_render.map_size=256",
+    "inverse_render.shape_subdivisions=0",
+    "inverse_render.shape_rounds=1",
+)
 BLOCKS, SAMPLES = 8, 24
 MOST_FILES = 4
 """Of many files of one kind (frames, masks) the first few stand for all."""

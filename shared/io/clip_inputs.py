@@ -22,7 +22,8 @@ class ClipInputs:
     """F frames with poses: camera_from_head [F, 4, 4]; intrinsics [3, 3] and size (width, height) of the pictures;
     moves: "head" or "camera"; face_segment [faces] index into segment_names, or None where the mesh has none.
 
-    place [F]: each frame's place in frames.
+    place [F]: each frame's place in frames; tracks: points [N, 3] on the skin and their errors [N] in pixels, where
+    mesh and poses are the tracked ones.
     """
 
     mesh: Mesh
@@ -34,6 +35,7 @@ class ClipInputs:
     place: np.ndarray
     face_segment: np.ndarray | None
     segment_names: tuple[str, ...]
+    tracks: tuple[np.ndarray, np.ndarray] | None = None
 
     def picture(self, f: int) -> Picture:
         """Frame f, decoded and ready for sampling."""
@@ -67,8 +69,10 @@ def read_inputs(
     segment = load_arrays(path).get("face_segment") if path.suffix == ".npz" else None
     names = tuple(read_json(tracked / "tracking.json")["segments"])
     poses = load_arrays(Path(pose_path)) if pose_path else tracked_poses
+    points = None if mesh_path or pose_path else load_arrays(tracked / "tracks.npz")
+    tracks = None if points is None else (points["points_head"], points["residual_px"])
     pose, index, place = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
-    inputs = ClipInputs(mesh, pose, frames.intrinsics, frames.size, frames.moves, frames, place, segment, names)
+    inputs = ClipInputs(mesh, pose, frames.intrinsics, frames.size, frames.moves, frames, place, segment, names, tracks)
     return inputs, frames, index
 
 

@@ -27,6 +27,8 @@ from shared.solve.chart_scale import describe_scale, doubt_scale, state_chart
 from shared.solve.fit_appearance import Solution, fit_appearance
 from shared.solve.frame_choice import covering_frames
 from shared.solve.reference_settings import ReferenceSettings
+from shared.solve.reshape import reshape
+from shared.solve.shape import Reflectance, ShapeSettings
 from shared.solve.texture import PRIOR_SPREAD, TexelMaterial
 from shared.solve.texture_pass import Clip, TexturePass
 from shared.texels import TexelSurface
@@ -41,7 +43,8 @@ class InverseInputs(Protocol):
     """What the solver needs of a clip; shared.io.clip_inputs.ClipInputs is one.
 
     picture(f): frame f of F ready for sampling; camera_from_head [F, 4, 4]; intrinsics [3, 3] and size (width, height)
-    of the pictures; moves: "head" or "camera"; face_segment [faces] or None where the mesh has no segments.
+    of the pictures; moves: "head" or "camera"; face_segment [faces] or None where the mesh has no segments; tracks:
+    points [N, 3] on the skin with their errors [N], px, or None.
     """
 
     mesh: Mesh
@@ -51,6 +54,7 @@ class InverseInputs(Protocol):
     moves: str
     face_segment: np.ndarray | None
     segment_names: tuple[str, ...]
+    tracks: tuple[np.ndarray, np.ndarray] | None
 
     def picture(self, f: int) -> Picture: ...
 
@@ -59,14 +63,15 @@ class InverseInputs(Protocol):
 class InverseSettings:
     """sizes of the light's problem, its settings, frames it is solved from, edge of the maps, hold-out period.
 
-    fit_frames: how many frames to fit, chosen to cover the face, 0: all but those held out; reference: solve by the
-    published algorithm instead."""
+    shape: how the mesh is refined, None: it stays as it is; fit_frames: how many frames to fit, chosen to cover the
+    face, 0: all but those held out; reference: solve by the published algorithm instead."""
 
     sizes: Sizes = field(default_factory=Sizes)
     appearance: Settings = field(default_factory=Settings)
     light_frames: int = 48
     map_size: int = 1024
     hold_out_every: int = 8
+    shape: ShapeSettings | None = field(default_factory=ShapeSettings)
     fit_frames: int = 0
     reference: ReferenceSettings | None = None
 
@@ -74,7 +79,7 @@ class InverseSettings:
 @dataclass(frozen=True)
 class InverseResult:
     """solution of the appearance fit, the texels' material, maps by name, the vertices' shading in all frames, the
-    viewer they belong to, and what is worth recording."""
+    viewer of the final mesh, and what is worth recording."""
 
     solution: Solution
     material: TexelMaterial
@@ -104,6 +109,18 @@ def solve_clip(
     moves = settings.appearance.light_moves(inputs.moves)
     chart, warning = state_chart(sights, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves)
     solution = _solve_light(inputs, settings, viewer, scenery, fitted, chart, progress, note)
+    shape_record = {"refined": False}
+    if settings.shape is not None and inputs.face_segment is not None:
+        known = Reflectance.of(solution, scenery)
+        frames = frames_of(inputs, settings, settings.shape.frames, fitted)
+        reshaped = reshape(inputs, frames, known, settings.appearance, settings.sizes, settings.shape, progress, note)
+        viewer_then = SurfaceViewer(reshaped.mesh, RayScene(reshaped.mesh.vertices, reshaped.mesh.faces))
+        scenery_then = set_scenery(viewer_then, settings.sizes, settings.appearance.visibility)
+        then = _solve_light(reshaped, settings, viewer_then, scenery_then, fitted, chart, progress, note)
+        shape_record = judge_shape(solution, then)
+        note(f"refined mesh: {shape_record}")
+        if shape_record["refined"]:
+            inputs, viewer, scenery, solution = reshaped, viewer_then, scenery_then, then
     shading = shade_vertices(inputs, settings.appearance, viewer, scenery, solution, progress)
     surface = TexelSurface(inputs.mesh, settings.map_size)
     clip = Clip(inputs.picture, inputs.camera_from_head, inputs.intrinsics, fitted)
@@ -116,8 +133,27 @@ def solve_clip(
     maps = make_maps(surface, material, roughness)
     skin = np.median(solution.state.albedo, axis=0)
     warnings = [*[warning] * bool(warning), *doubt_scale(chart, skin)]
-    record = {"texture": texture_record, "albedo_scale": describe_scale(chart, skin), "warnings": warnings}
+    record = {"texture": texture_record, "shape": shape_record, "warnings": warnings}
+    record |= {"albedo_scale": describe_scale(chart, skin)}
     return InverseResult(solution, material, maps, shading, viewer, fitted, record)
+
+
+def judge_shape(before: Solution, after: Solution) -> dict:
+    """Is the refined mesh kept, and why: held-out residuals, fitted ones where no frame could be held out."""
+    name = "held_out" if before.held_out > 0 else "fitted"
+    residuals = {"before": getattr(before, name), "after": getattr(after, name)}
+    return {"refined": residuals["after"] < residuals["before"], name: residuals}
+
+
+def frames_of(
+    inputs: InverseInputs, settings: InverseSettings, wanted: int, fitted: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """At most wanted frames, evenly spread, and which of them are fitted."""
+    chosen = spread_frames(len(inputs.camera_from_head), wanted)
+    if settings.fit_frames:
+        chosen = np.union1d(chosen, np.nonzero(fitted)[0])
+    # Every part of the solve needs held-out frames too: where thinning left too few, hold out among the thinned.
+    return chosen, fitted[chosen] if (~fitted[chosen]).sum() >= 2 else hold_out(len(chosen), settings.hold_out_every)
 
 
 def frames_to_fit(inputs: InverseInputs, settings: InverseSettings, viewer: SurfaceViewer) -> np.ndarray:
@@ -141,11 +177,7 @@ def segment_vertices(inputs: InverseInputs, names: tuple[str, ...]) -> np.ndarra
 
 
 def _solve_light(inputs, settings, viewer, scenery: Scenery, fitted, chart, progress, note) -> Solution:
-    chosen = spread_frames(len(inputs.camera_from_head), settings.light_frames)
-    if settings.fit_frames:
-        chosen = np.union1d(chosen, np.nonzero(fitted)[0])
-    # The light's own frames need held-out ones too: where thinning left too few, hold out among the thinned.
-    kept = fitted[chosen] if (~fitted[chosen]).sum() >= 2 else hold_out(len(chosen), settings.hold_out_every)
+    chosen, kept = frames_of(inputs, settings, settings.light_frames, fitted)
     skin = segment_vertices(inputs, FACE_SKIN)
     capture = build_capture(
         viewer,
@@ -235,6 +267,7 @@ def summarise(inputs: InverseInputs, result: InverseResult, frame_index: np.ndar
             "held_out": solution.held_out,
             "texture_held_out": result.record["texture"]["held_out"],
         },
+        **{key: result.record[key] for key in ("shape",) if key in result.record},
         "iterations": list(solution.iterations),
         "albedo_scale": result.record["albedo_scale"],
         "held_out_frames": [int(frame) for frame in frame_index[~result.fitted]],

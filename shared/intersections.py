@@ -1,0 +1,54 @@
+"""Where a mesh cuts itself, and how to move it without that.
+
+Two triangles that cross do so along a segment whose ends lie on an edge of one or the other: it is enough to follow
+every edge and see whether it meets a face.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shared.mesh import vertex_adjacency
+from shared.raycast import RayScene
+
+_ENDS = 1e-3
+"""Share of an edge at both ends that is not followed: there the faces around it begin."""
+_MOST_HALVINGS = 4
+
+
+def crossing_edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[N, 2] edges (vertex pairs, the lower first) that pass through a face they have no vertex in common with."""
+    pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges = np.unique(pairs, axis=0)
+    along = vertices[edges[:, 1]] - vertices[edges[:, 0]]
+    scene = RayScene(vertices, faces)
+    found = np.zeros(len(edges), bool)
+    for first, sign in ((0, 1.0), (1, -1.0)):
+        # From both ends: the first face met may be a neighbour of the edge that hides another.
+        origins = vertices[edges[:, first]] + _ENDS * sign * along
+        face, _, distance = scene.intersect(origins, sign * along)
+        met = (face >= 0) & (distance < 1.0 - 2.0 * _ENDS)
+        own = (faces[face][:, :, None] == edges[:, None, :]).any((1, 2))
+        found |= met & ~own
+    return edges[found]
+
+
+def move_without_crossing(start: np.ndarray, wanted: np.ndarray, faces: np.ndarray, rings: int = 2) -> np.ndarray:
+    """Vertices [V, 3] as near to wanted as goes without crossings that start did not have.
+
+    Where moved faces cross, the move of the vertices around is halved, at last undone.
+    """
+    before = {tuple(edge) for edge in crossing_edges(start, faces)}
+    adjacency = vertex_adjacency(faces, len(start))
+    share = np.ones(len(start))
+    for attempt in range(_MOST_HALVINGS + 1):
+        placed = start + share[:, None] * (wanted - start)
+        bad = [edge for edge in map(tuple, crossing_edges(placed, faces)) if edge not in before]
+        if not bad:
+            return placed
+        around = np.zeros(len(start))
+        around[np.ravel(bad)] = 1.0
+        for _ in range(rings + attempt):
+            around = np.maximum(around, (adjacency @ around > 0) * 1.0)
+        share = np.where(around > 0, 0.5 * share if attempt < _MOST_HALVINGS - 1 else 0.0, share)
+    return start + share[:, None] * (wanted - start)

@@ -1,0 +1,85 @@
+"""The shape's part of inverse rendering: what is shaped, from which frames, and whether the result is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from shared.geometry import camera_centres
+from shared.intersections import move_without_crossing
+from shared.mesh import Mesh, normalised
+from shared.solve.appearance import Settings
+from shared.solve.capture import Sizes
+from shared.solve.shape import HELD, SHAPED, Reflectance, ShapeClip, ShapeSettings, ShapeSolver
+from shared.solve.shape_step import TrackPoints
+
+TRACK_FLOOR_MM = 0.1
+"""Error of a track point that more frames or sharper pictures do not lessen."""
+
+
+class Reshaped:
+    """A clip's inputs with another mesh in the place of theirs."""
+
+    def __init__(self, inputs, mesh: Mesh):
+        self._inputs, self.mesh = inputs, mesh
+        self.face_segment = segments_of(inputs, mesh)
+
+    def __getattr__(self, name: str):
+        return getattr(self._inputs, name)
+
+
+def segments_of(inputs, mesh: Mesh) -> np.ndarray | None:
+    """[faces] segments of the inputs' mesh or of one that it was subdivided into; None where it has none."""
+    times = len(mesh.faces) // len(inputs.mesh.faces)
+    return None if inputs.face_segment is None else np.repeat(inputs.face_segment, times)
+
+
+def faces_of(inputs, names: tuple[str, ...]) -> np.ndarray:
+    """[faces] bool: faces in the named segments."""
+    wanted = [inputs.segment_names.index(name) for name in names if name in inputs.segment_names]
+    return np.isin(inputs.face_segment, wanted)
+
+
+def track_points(
+    positions: np.ndarray, residual_px: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray
+) -> TrackPoints:
+    """Track points [N, 3] with the depth's standard deviation that their errors [N] and the clip's parallax leave."""
+    directions = normalised(camera_centres(camera_from_head))
+    half_angle = 0.5 * np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0))
+    px_per_mm = intrinsics[0, 0] / np.median(camera_from_head[:, 2, 3])
+    depth = residual_px / px_per_mm / max(np.sin(half_angle), 0.01)
+    known = np.isfinite(depth)
+    return TrackPoints(positions[known], np.hypot(TRACK_FLOOR_MM, depth[known]))
+
+
+def reshape(
+    inputs,
+    frames: tuple[np.ndarray, np.ndarray],
+    reflectance: Reflectance,
+    appearance: Settings,
+    sizes: Sizes,
+    settings: ShapeSettings,
+    progress: Callable,
+    note: Callable,
+) -> Reshaped:
+    """The inputs with their mesh refined under a known light; frames: which, and which of them are fitted."""
+    chosen, fitted = frames
+    tracks = None
+    if inputs.tracks is not None:
+        tracks = track_points(*inputs.tracks, inputs.camera_from_head, inputs.intrinsics)
+    clip = ShapeClip(
+        lambda i: inputs.picture(int(chosen[i])),
+        inputs.camera_from_head[chosen],
+        inputs.intrinsics,
+        fitted,
+        appearance.light_moves(inputs.moves),
+        tracks,
+    )
+    solver = ShapeSolver(clip, reflectance, appearance, sizes, settings, progress, note)
+    start, refined = solver.refine(inputs.mesh, faces_of(inputs, SHAPED), faces_of(inputs, HELD))
+    placed = move_without_crossing(start.vertices, refined.vertices, refined.faces)
+    undone = (np.abs(placed - refined.vertices).max(1) > 1e-6).sum()
+    if undone:
+        note(f"shape: {undone} vertices moved less than wanted, so that the surface does not cut itself")
+    return Reshaped(inputs, refined.replace(vertices=placed))

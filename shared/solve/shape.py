@@ -1,0 +1,239 @@
+"""Shape from parallax and shading together, under a light and a reflectance that are known: Gauss-Newton steps.
+
+Each step samples the frames at the vertices, shades the vertices, sums up what the samples say of place and normal, and
+solves one sparse system. Visibility and bounces are traced anew after each step. Frames that were held out decide
+whether a step is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.sparse as sparse
+
+from shared.gather import SurfaceViewer
+from shared.mesh import Mesh, subdivide, vertex_normals
+from shared.raycast import RayScene
+from shared.shading import DEEP, Material, VertexShading
+from shared.solve.appearance import Settings
+from shared.solve.capture import Scenery, Sizes, face_front, set_scenery
+from shared.solve.fit_appearance import Solution
+from shared.solve.local_roughness import GlossEquations
+from shared.solve.shape_equations import EquationSettings, PointEquations, point_equations
+from shared.solve.shape_samples import gather_surface
+from shared.solve.shape_step import (
+    LARGEST_STEP_EDGES,
+    TrackPoints,
+    large_step_metric,
+    normal_turns,
+    point_terms,
+    solve_offsets,
+    track_rows,
+)
+from shared.solve.shape_terms import shading_terms
+from shared.transfer import Nodes, Transfer, mesh_points, nearest_points
+
+SHAPED = ("forehead", "brows", "lids", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "lips", "chin", "jaw")
+"""Segments whose samples shape the surface. Ears, neck and scalp follow them; what HELD names stays the model's."""
+HELD = ("eyes", "inner_mouth", "eye_sockets")
+MINIMUM_FRAMES, FEWEST_POINTS = 4, 50
+BLUR_EDGES = 0.4
+"""Standard width of the pictures' blur over the typical edge: what a vertex stands for."""
+
+
+@dataclass(frozen=True)
+class ShapeSettings:
+    """subdivisions: finer levels beyond the given mesh; rounds: most steps per level; smoothness: lambda of the large
+    steps; sigma_mm: how far the surface may be from the start as a whole; frames: that the shape is solved from."""
+
+    subdivisions: int = 1
+    rounds: int = 2
+    frames: int = 48
+    smoothness: float = 19.0
+    sigma_mm: float = 8.0
+    equations: EquationSettings = field(default_factory=EquationSettings)
+
+
+@dataclass(frozen=True)
+class Reflectance:
+    """What the shape is solved under: light [6 n^2, 3], specular intensity, roughness and how it varies; nodes with
+    their albedo [K, 3]: where light bounced when it was solved."""
+
+    light: np.ndarray
+    specular: float
+    roughness: float
+    nodes: Nodes
+    node_albedo: np.ndarray
+    gloss: GlossEquations | None = None
+
+    @staticmethod
+    def of(solution: Solution, scenery: Scenery) -> Reflectance:
+        """That of a solved appearance."""
+        state = solution.state
+        known = state.light, state.specular, state.roughness, scenery.nodes, state.node_albedo
+        return Reflectance(*known, solution.gloss)
+
+
+@dataclass(frozen=True)
+class ShapeClip:
+    """picture(f) of F frames, camera_from_head [F, 4, 4], intrinsics, fitted [F] bool, what moves against the light,
+    and the track points, where there are any."""
+
+    picture: Callable
+    camera_from_head: np.ndarray
+    intrinsics: np.ndarray
+    fitted: np.ndarray
+    moves: str
+    tracks: TrackPoints | None = None
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A mesh, the vertices index [P] that are shaped, and their equations."""
+
+    mesh: Mesh
+    index: np.ndarray
+    tangents: np.ndarray
+    equations: PointEquations
+
+
+@dataclass(frozen=True)
+class Traced:
+    """The transfer of vertices index [P], traced once per level: steps move the surface by far less than what it sees
+    is away."""
+
+    scenery: Scenery
+    index: np.ndarray
+    transfer: Transfer
+
+    def turned_to(self, normals: np.ndarray) -> Transfer:
+        """The transfer for other normals [P, 3] under the same visibility."""
+        directions = self.scenery.directions
+        cosine = np.maximum(normals @ directions.T, 0.0) * (4.0 / len(directions))
+        return replace(self.transfer, direct=(cosine * self.transfer.visibility()).astype(np.float16))
+
+
+class ShapeSolver:
+    """Refines a mesh and its subdivisions from a clip."""
+
+    def __init__(
+        self,
+        clip: ShapeClip,
+        reflectance: Reflectance,
+        appearance: Settings,
+        sizes: Sizes,
+        settings: ShapeSettings,
+        progress: Callable = lambda items, label: items,
+        note: Callable = lambda text: None,
+    ):
+        self.progress = progress
+        self.clip, self.reflectance = clip, reflectance
+        self.appearance, self.sizes, self.settings, self.note = appearance, sizes, settings, note
+
+    def trace(self, mesh: Mesh, shaped: np.ndarray) -> Traced:
+        """What the shaped faces' vertices that some frame faces see of the sphere and of the head."""
+        viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
+        scenery = set_scenery(viewer, self.sizes, self.appearance.visibility)
+        wanted = np.zeros(len(mesh.vertices), bool)
+        wanted[mesh.faces[shaped]] = True
+        index = np.nonzero(wanted & face_front(viewer, self.clip.camera_from_head, 0.2))[0]
+        return Traced(scenery, index, scenery.trace(mesh_points(mesh, index)))
+
+    def examine(self, mesh: Mesh, shaped: np.ndarray, traced: Traced) -> Surface | None:
+        """Samples, shading and equations of the traced vertices; None where hardly any is seen."""
+        clip, settings, index = self.clip, self.settings, traced.index
+        viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
+        pictures = (clip.picture(f) for f in self.progress(range(len(clip.camera_from_head)), "shape, sampling"))
+        blur = BLUR_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
+        samples = gather_surface(viewer, index, pictures, clip.camera_from_head, clip.intrinsics, blur)
+        points = mesh_points(mesh, index)
+        transfer = traced.turned_to(points.normals)
+        seen = (samples.weight[:, clip.fitted] > 0).sum(1) >= min(MINIMUM_FRAMES, int(clip.fitted.sum()))
+        rows = np.nonzero(seen & (transfer.blocked < DEEP))[0]
+        if len(rows) < FEWEST_POINTS:
+            return None
+        shading = self._shade(mesh, traced.scenery, index, points, transfer)
+        samples = samples.points(rows)
+        terms = shading_terms(shading, rows, self.appearance.specular)
+        points = points.take(rows)
+        equations = point_equations(
+            samples, terms, points.positions, points.normals, self.reflectance.specular, clip.fitted, settings.equations
+        )
+        return Surface(mesh, index[rows], terms.tangents, equations)
+
+    def _shade(self, mesh, scenery, index, points, transfer) -> VertexShading:
+        known = self.reflectance
+        local = None if known.gloss is None else known.gloss.roughness(points.positions)
+        node_albedo = known.node_albedo[nearest_points(scenery.nodes.points, known.nodes.points)]
+        return VertexShading(
+            index,
+            mesh.vertices,
+            points,
+            transfer,
+            scenery.node_transfer,
+            Material(node_albedo, known.specular, known.roughness, local),
+            known.light,
+            scenery.directions,
+            self.clip.camera_from_head,
+            self.clip.moves,
+            bounce=self.appearance.bounce,
+        )
+
+    def step(self, surface: Surface, start: np.ndarray, shaped: np.ndarray, held: np.ndarray) -> np.ndarray:
+        """Offsets [V] along the normals."""
+        mesh, count = surface.mesh, len(surface.mesh.vertices)
+        normals = vertex_normals(mesh.vertices, mesh.faces)
+        turns = normal_turns(mesh.vertices, mesh.faces, normals, surface.index, surface.tangents)
+        terms = [point_terms(surface.index, turns, surface.equations.hessian, surface.equations.gradient, count)]
+        if self.clip.tracks is not None:
+            rows, height, weight = track_rows(mesh.vertices, mesh.faces, normals, shaped, self.clip.tracks)
+            weighted = rows.T @ sparse.diags(weight)
+            terms.append(((weighted @ rows).tocsr(), -(weighted @ height)))
+        metric = large_step_metric(mesh.faces, count, self.settings.smoothness, self.settings.sigma_mm)
+        free = np.ones(count, bool)
+        free[mesh.faces[held]] = False
+        offsets = solve_offsets(mesh.vertices, start, normals, metric, free, terms)
+        largest = LARGEST_STEP_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
+        return np.clip(offsets, -largest, largest)
+
+    def refine(self, mesh: Mesh, shaped: np.ndarray, held: np.ndarray) -> tuple[Mesh, Mesh]:
+        """The mesh subdivided as the settings say, as it was and refined. shaped, held [faces] bool."""
+        start = mesh
+        for level in range(self.settings.subdivisions + 1):
+            if level > 0:
+                shaped, held = np.repeat(shaped, 4), np.repeat(held, 4)
+                start, mesh = subdivide(start), subdivide(mesh)
+            mesh = self._refine_level(mesh, start.vertices, shaped, held, level)
+        return start, mesh
+
+    def _refine_level(self, mesh, start, shaped, held, level) -> Mesh:
+        traced = self.trace(mesh, shaped)
+        surface = self.examine(mesh, shaped, traced)
+        if surface is None:
+            self.note(f"shape level {level}: too little of the face is seen, the mesh stays")
+            return mesh
+        self.note(f"shape level {level}: {len(surface.index)} points, {_residuals(surface)}")
+        for _ in range(self.settings.rounds):
+            offsets = self.step(surface, start, shaped, held)
+            normals = vertex_normals(surface.mesh.vertices, surface.mesh.faces)
+            vertices = surface.mesh.vertices + offsets[:, None] * normals
+            moved = self.examine(mesh.replace(vertices=vertices), shaped, traced)
+            if moved is None:
+                break
+            moves = np.abs(offsets[moved.index])
+            self.note(f"  moved {np.median(moves):.3f} mm, 95 % {np.percentile(moves, 95):.3f}: {_residuals(moved)}")
+            if moved.equations.judged > surface.equations.judged:
+                break
+            surface = moved
+        return surface.mesh
+
+
+def typical_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Median length of the faces' first edges, mm."""
+    return float(np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)))
+
+
+def _residuals(surface: Surface) -> str:
+    return f"residual {surface.equations.fitted:.5f} fitted, {surface.equations.held_out:.5f} held out"

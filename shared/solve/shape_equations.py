@@ -1,0 +1,143 @@
+"""What the samples of each surface point say about its place and its normal.
+
+Unknown at a point: its offset h along the normal, mm, and the normal's turn k [2] towards two tangents, radians. The
+residual of channel c in frame f, r = a E + s S - I, changes by
+
+    dr/dh = -grad I . (d pixel / dx) n          the point reads another place of the picture (parallax)
+    dr/dk = a dE/dk + s dS/dk                   it is lit differently (shading)
+
+with the albedo a eliminated per point and channel (variable projection), so that only what changes from frame to frame
+counts and no texture can pass for relief. Errors of light, bounces and pose are smooth over the face: the part of the
+residuals that is smooth in each frame is laid to them, relative to the modelled radiance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.spatial import cKDTree
+
+from shared.solve.shape_samples import SurfaceSamples
+from shared.solve.shape_terms import ShadingTerms
+from shared.transfer import spread_vertices
+
+MINIMUM_ALBEDO, MAXIMUM_ALBEDO = 0.003, 1.0
+CAUCHY_SCALE = 2.5
+LARGEST_SQUARED_ERROR = 0.01
+"""A sample that is off by more than a tenth of full scale shows something else than the surface."""
+
+
+@dataclass(frozen=True)
+class PointEquations:
+    """Quadratic models of P points' costs in (h, k1, k2): hessian [P, 3, 3], gradient [P, 3]; albedo [P, 3]; rms
+    residuals of fitted and of held-out frames."""
+
+    hessian: np.ndarray
+    gradient: np.ndarray
+    albedo: np.ndarray
+    fitted: float
+    held_out: float
+
+    @property
+    def judged(self) -> float:
+        """The residual to judge by: of held-out frames, of the fitted ones where none is held out."""
+        return self.held_out or self.fitted
+
+
+class SmoothField:
+    """Smooths values over points [P, 3] with a kernel of standard width width_mm, by way of nodes that far apart."""
+
+    def __init__(self, points: np.ndarray, width_mm: float):
+        area = float(np.prod(np.sort(np.ptp(points, axis=0))[1:]))
+        nodes = points[spread_vertices(points, max(8, int(2.0 * area / width_mm**2)))]
+        distance, near = cKDTree(nodes).query(points, k=min(8, len(nodes)))
+        weight = np.exp(-0.5 * (distance / width_mm) ** 2)
+        weight /= weight.sum(1, keepdims=True)
+        rows = np.repeat(np.arange(len(points)), near.shape[1])
+        self.spread = sparse.csr_matrix((weight.ravel(), (rows, near.ravel())), (len(points), len(nodes)))
+
+    def __call__(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """values, weight [P, ...] -> weighted local means, the same shape."""
+        flat = weight.reshape(len(weight), -1)
+        total = self.spread.T @ flat
+        mean = self.spread.T @ (flat * values.reshape(len(values), -1)) / np.maximum(total, 1e-9)
+        return (self.spread @ mean).reshape(values.shape)
+
+
+@dataclass(frozen=True)
+class EquationSettings:
+    """noise: absolute and relative standard deviation of a sample; correlated: how many samples count as one
+    independent; smooth_mm: width over which residuals are laid to light and pose, 0: none are."""
+
+    noise: tuple[float, float] = (0.006, 0.03)
+    correlated: float = 5.0
+    smooth_mm: float = 12.0
+
+
+def point_equations(
+    samples: SurfaceSamples,
+    terms: ShadingTerms,
+    points: np.ndarray,
+    normals: np.ndarray,
+    specular: float | np.ndarray,
+    fitted: np.ndarray,
+    settings: EquationSettings,
+) -> PointEquations:
+    """Equations of P points [P, 3] with normals [P, 3]; specular: intensity, one or [P]; fitted [F] bool."""
+    specular = np.broadcast_to(np.asarray(specular, np.float32), (len(points),))[:, None, None]
+    gloss = specular * terms.reflection
+    albedo, weight = _fit_albedo(samples, terms.irradiance, gloss, fitted, settings.noise)
+    model = albedo[:, None] * terms.irradiance + gloss
+    error = model - samples.colours
+    rms = _rms(error, samples, fitted)
+    weight = weight * fitted[:, None]
+    if settings.smooth_mm > 0:
+        scale = np.maximum(model, 1e-3)
+        error = error - scale * SmoothField(points, settings.smooth_mm)(error / scale, weight * scale**2)
+    along = np.einsum("pfix,px->pfi", samples.pixels_per_mm, normals.astype(np.float32))
+    slopes = np.empty(error.shape + (3,), np.float32)
+    slopes[..., 0] = -np.einsum("pfci,pfi->pfc", samples.gradient.astype(np.float32), along)
+    turn = albedo[:, None, :, None] * terms.irradiance_turn
+    slopes[..., 1:] = turn + specular[..., None] * terms.reflection_turn
+    power = np.maximum((weight * terms.irradiance**2).sum(1), 1e-9)
+    weighted = weight * terms.irradiance
+    slopes -= terms.irradiance[..., None] * ((weighted[..., None] * slopes).sum(1) / power[..., None])[:, None]
+    error -= terms.irradiance * ((weighted * error).sum(1) / power)[:, None]
+    count = np.maximum((weight > 0).sum(), 1)
+    misfit = max(1.0, float((weight * error**2).sum() / count))
+    evidence = 1.0 / (misfit * settings.correlated)
+    rows = slopes.reshape(len(slopes), -1, 3)
+    scaled = rows * (evidence * weight).reshape(len(slopes), -1, 1)
+    hessian = np.swapaxes(scaled, 1, 2) @ rows
+    gradient = (scaled * error.reshape(len(slopes), -1, 1)).sum(1)
+    return PointEquations(hessian.astype(np.float64), gradient.astype(np.float64), albedo, *rms)
+
+
+def _fit_albedo(samples, irradiance, gloss, fitted, noise) -> tuple[np.ndarray, np.ndarray]:
+    """Albedo [P, 3] of the fitted frames and robust, censored weights [P, F, 3] of all."""
+    sigma = noise[0] + noise[1] * samples.colours
+    base = samples.weight[..., None] / sigma**2
+    weight = base * (samples.limits == 0)
+    for _ in range(3):
+        used = weight * fitted[:, None] * irradiance
+        albedo = (used * (samples.colours - gloss)).sum(1) / np.maximum((used * irradiance).sum(1), 1e-9)
+        albedo = np.clip(albedo, MINIMUM_ALBEDO, MAXIMUM_ALBEDO)
+        error = albedo[:, None] * irradiance + gloss - samples.colours
+        weight = base * ~_satisfied(error, samples.limits) / (1.0 + (error / (CAUCHY_SCALE * sigma)) ** 2)
+    return albedo, weight
+
+
+def _satisfied(error: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    return ((limits > 0) & (error >= 0)) | ((limits < 0) & (error <= 0))
+
+
+def _rms(error: np.ndarray, samples: SurfaceSamples, fitted: np.ndarray) -> tuple[float, float]:
+    """Trust-weighted rms residual of fitted and of held-out frames."""
+    squared = (np.minimum(error**2, LARGEST_SQUARED_ERROR) * ~_satisfied(error, samples.limits)).sum(2)
+    result = []
+    for chosen in (fitted, ~fitted):
+        weight = samples.weight * chosen
+        result.append(float(np.sqrt((weight * squared).sum() / max(3.0 * weight.sum(), 1e-9))))
+    return result[0], result[1]

@@ -1,0 +1,168 @@
+"""Shape from shading, parallax and outline on an egg with a dent that the start does not have, and its parts."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from shapes import sphere
+from toy_head import toy_head
+
+from shared.envmap import cube_directions
+from shared.gather import SurfaceViewer, prepare_picture
+from shared.geometry import rigid, rotation_from_vector
+from shared.mesh import Mesh, interpolate, normalised, vertex_normals
+from shared.raycast import RayScene, camera_hits
+from shared.shading import Material, VertexShading
+from shared.solve.appearance import Settings
+from shared.solve.capture import Sizes, set_scenery
+from shared.solve.shape import Reflectance, ShapeClip, ShapeSettings, ShapeSolver
+from shared.solve.shape_equations import EquationSettings
+from shared.solve.shape_samples import projection_slope, tangent_frames
+from shared.solve.shape_step import TrackPoints, large_step_metric, normal_turns
+from shared.solve.shape_terms import shading_terms
+from shared.transfer import mesh_points
+
+FRAMES, SIZE, ROUGHNESS, SPECULAR = 20, 240, 0.4, 0.7
+LENS = np.array([[900.0, 0, SIZE / 2], [0, 900.0, SIZE / 2], [0, 0, 1]])
+SIZES = Sizes(directions=384, nodes=100)
+
+
+def true_light(directions):
+    lamp = np.exp(5.0 * (directions @ normalised(np.array([-0.6, 0.5, 0.7])) - 1.0))
+    sky = 0.35 + 0.2 * directions[:, 1]
+    return np.stack([sky + 2.0 * lamp, sky + 1.8 * lamp, 1.1 * sky + 1.6 * lamp], axis=1)
+
+
+def true_albedo(positions):
+    x, y, z = positions.T / 9.0
+    pattern = 0.2 * np.sin(2.1 * x + y) + 0.2 * np.cos(1.7 * y - z) + 0.1 * np.sin(3.0 * z + 2.0 * x)
+    return np.array([0.45, 0.31, 0.23]) * np.exp(pattern)[:, None]
+
+
+def swinging(frames=FRAMES):
+    angle = np.linspace(0, 2 * np.pi, frames)
+    vectors = np.stack([0.2 * np.sin(2 * angle), 0.5 * np.sin(angle), 0 * angle], axis=1)
+    return rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors), np.tile([0, 0, 900.0], (frames, 1)))
+
+
+@dataclass
+class Toy:
+    start: Mesh
+    truth: Mesh
+    clip: ShapeClip
+    reflectance: Reflectance
+
+
+def shade(mesh, poses, light):
+    """Vertex shading, its scenery and material under a light."""
+    viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
+    scenery = set_scenery(viewer, SIZES)
+    points = mesh_points(mesh)
+    material = Material(true_albedo(scenery.nodes.points.positions), SPECULAR, ROUGHNESS)
+    index = np.arange(len(mesh.vertices))
+    transfer = scenery.trace(points)
+    traced = points, transfer, scenery.node_transfer
+    shading = VertexShading(index, mesh.vertices, *traced, material, light, scenery.directions, poses, "head")
+    return shading, scenery, material
+
+
+@pytest.fixture(scope="module")
+def toy():
+    """The dent is 2.5 mm deep and some 30 mm wide, on the cheek; there are track points around but not in it."""
+    start = toy_head(5).mesh(np.zeros(2), np.zeros(1))
+    normals = vertex_normals(start.vertices, start.faces)
+    place = np.array([35.0, -15.0, 80.0])
+    depth = 2.5 * np.exp(-0.5 * (np.linalg.norm(start.vertices - place, axis=1) / 14.0) ** 2)
+    truth = start.replace(vertices=start.vertices - depth[:, None] * normals)
+    poses, light = swinging(), true_light(cube_directions(16))
+    shading, scenery, material = shade(truth, poses, light)
+    albedo, scene = true_albedo(truth.vertices), RayScene(truth.vertices, truth.faces)
+    pictures = []
+    for f, pose in enumerate(poses):
+        radiance = albedo * shading.irradiance(f) + SPECULAR * shading.reflection(f)
+        total = np.zeros((SIZE, SIZE, 3))
+        for offset in ((0.25, 0.25), (0.25, 0.75), (0.75, 0.25), (0.75, 0.75)):
+            face, bary, _ = camera_hits(scene, pose, LENS, SIZE, SIZE, offset)
+            total[face >= 0] += 0.25 * interpolate(radiance, truth.faces, face[face >= 0], bary[face >= 0])
+        codes = np.clip(np.round(total * 65535 / 2.0), 0, 65535).astype(np.uint16)
+        mask = np.where(camera_hits(scene, pose, LENS, SIZE, SIZE)[0] >= 0, 255, 0).astype(np.uint8)
+        pictures.append(prepare_picture(codes, (codes / 65535.0 * 2.0).astype(np.float32), mask))
+    fitted = np.arange(FRAMES) % 5 != 2
+    known = np.nonzero((depth < 0.01) & (start.vertices[:, 2] > 20.0))[0][::3]
+    tracks = TrackPoints(start.vertices[known], np.full(len(known), 0.15))
+    clip = ShapeClip(pictures.__getitem__, poses, LENS, fitted, "head", tracks)
+    known = Reflectance(light, SPECULAR, ROUGHNESS, scenery.nodes, material.node_albedo)
+    return Toy(start, truth, clip, known)
+
+
+def solver_of(toy, **changes):
+    return ShapeSolver(toy.clip, toy.reflectance, Settings(), SIZES, ShapeSettings(**changes))
+
+
+def test_projection_slope_is_the_derivative_of_the_projection():
+    from shared.geometry import project
+
+    points, pose = np.array([[10.0, -20.0, 60.0], [-40.0, 30.0, 20.0]]), swinging()[3]
+    slope = projection_slope(points, pose, LENS)
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = 1e-4
+        changed = project(points + step, pose, LENS)[0] - project(points - step, pose, LENS)[0]
+        np.testing.assert_allclose(slope[:, :, axis], changed / 2e-4, atol=1e-6)
+
+
+def test_normals_turn_as_the_vertices_say():
+    ball = sphere(50.0, 3)
+    normals = vertex_normals(ball.vertices, ball.faces)
+    offsets = 1e-3 * np.random.default_rng(0).normal(size=len(normals))
+    index = np.arange(0, len(normals), 3)
+    tangents = tangent_frames(normals[index])
+    turns = normal_turns(ball.vertices, ball.faces, normals, index, tangents)
+    moved = vertex_normals(ball.vertices + offsets[:, None] * normals, ball.faces)
+    true = np.einsum("px,pkx->kp", (moved - normals)[index], tangents)
+    for k in range(2):
+        np.testing.assert_allclose(turns[k] @ offsets, true[k], atol=0.03 * np.abs(true).max())
+
+
+def test_metric_is_the_squared_large_step():
+    ball = sphere(1.0, 2)
+    values = np.random.default_rng(1).normal(size=len(ball.vertices))
+    neighbours = [set() for _ in values]
+    for a, b, c in ball.faces:
+        for v, others in ((a, (b, c)), (b, (a, c)), (c, (a, b))):
+            neighbours[v].update(others)
+    laplacian = np.array([len(near) * values[v] - values[list(near)].sum() for v, near in enumerate(neighbours)])
+    expected = np.square(values + 19.0 * laplacian).sum() / 4.0
+    metric = large_step_metric(ball.faces, len(values), 19.0, 2.0)
+    assert values @ metric @ values == pytest.approx(expected)
+
+
+def test_irradiance_turns_with_the_normal(toy):
+    """Shading of a point whose normal alone is turned, against the linear prediction."""
+    poses = swinging(4)
+    mesh = toy.truth
+    shading, _, _ = shade(mesh, poses, toy.reflectance.light)
+    rows = np.nonzero((mesh.vertices[:, 2] > 70.0) & (shading.transfer.blocked < 0.01))[0][::40]
+    terms = shading_terms(shading, rows, True)
+    turned = normalised(shading.points.normals[rows] + 0.05 * terms.tangents[:, 0])
+    weight = np.maximum(turned @ shading.directions.T, 0.0) * (4.0 / len(shading.directions))
+    direct = np.einsum("pj,jfc->pfc", weight * shading.transfer.visibility(rows), shading.light_along)
+    upright = np.maximum(shading.points.normals[rows] @ shading.directions.T, 0.0) * (4.0 / len(shading.directions))
+    before = np.einsum("pj,jfc->pfc", upright * shading.transfer.visibility(rows), shading.light_along)
+    change = (direct - before) / 0.05
+    np.testing.assert_allclose(terms.irradiance_turn[..., 0], change, atol=0.06 * np.abs(change).max())
+
+
+def test_dent_is_found(toy):
+    # The dent is as wide as what is otherwise laid to light and pose.
+    solver = solver_of(toy, subdivisions=0, rounds=4, smoothness=3.0, equations=EquationSettings(smooth_mm=0.0))
+    depth = toy.start.vertices[toy.start.faces].mean(1)[:, 2]
+    _, refined = solver.refine(toy.start, depth > 20.0, depth < -40.0)
+    normals = vertex_normals(toy.start.vertices, toy.start.faces)
+    wrong = ((toy.start.vertices - toy.truth.vertices) * normals).sum(1)
+    left = ((refined.vertices - toy.truth.vertices) * normals).sum(1)
+    dented = wrong > 0.5
+    assert np.sqrt(np.mean(left[dented] ** 2)) < 0.3 * np.sqrt(np.mean(wrong[dented] ** 2))
+    elsewhere = (wrong < 0.01) & (toy.start.vertices[:, 2] > 40.0)
+    assert np.median(np.abs(left[elsewhere])) < 0.1
+    np.testing.assert_array_equal(refined.faces, toy.start.faces)
