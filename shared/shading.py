@@ -28,8 +28,9 @@ KEY_STEP = 0.05
 DEEP = 0.9
 """Cosine-weighted share of the hemisphere that the head itself covers, from which on a point counts as in a cavity."""
 
-
 LARGEST_SHARE = 0.95
+"""Of the light that arrives, what a surface can send on: were it all of it, bounces would not end."""
+_POINTS_PER_BLOCK = 8192
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,22 @@ class VertexShading:
     def mean_irradiance(self) -> np.ndarray:
         """[V, 3] float32: E averaged over the frames."""
         return self._irradiance.mean(1, dtype=np.float32)[self.stand_in]
+
+    def mean_slope(self) -> np.ndarray:
+        """[V, 3] float32: by how much the mean irradiance changes per radian that the normal turns, at most.
+
+        E = n . W with the irradiance vector W (Arvo 1994), so it is the length of what of W lies in the surface.
+        """
+        light = self.light_along.mean(1)
+        moments = (light[:, :, None] * self.directions[:, None] * (4.0 / len(self.directions))).astype(np.float32)
+        slope = np.empty((len(self.points), light.shape[1]), np.float32)
+        for start in range(0, len(slope), _POINTS_PER_BLOCK):
+            rows = np.arange(start, min(start + _POINTS_PER_BLOCK, len(slope)))
+            visible, normals = self.transfer.visibility(rows).astype(np.float32), self.points.normals[rows]
+            vector = (visible @ moments.reshape(len(light), -1)).reshape(len(rows), -1, 3)
+            along = np.einsum("pcx,px->pc", vector, normals)
+            slope[rows] = np.linalg.norm(vector - along[..., None] * normals[:, None], axis=2)
+        return slope[self.stand_in]
 
     def reflection(self, frame: int) -> np.ndarray:
         """S [V, 3] float32 at specular_intensity 1, between the two key frames around this one.

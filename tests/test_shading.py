@@ -143,6 +143,26 @@ def test_irradiance_follows_the_frames(moves):
         assert np.allclose(shading.irradiance(f), expected, rtol=0.02, atol=0.01 * expected.max())
 
 
+def test_mean_slope_is_the_irradiance_s_derivative_by_the_normal():
+    """Differences of the hemisphere's integral between turned normals; a uniform light has no slope."""
+    poses = nods(np.array([0.0, 30.0, 60.0]), axis=(0.6, 0.8, 0.0))
+    light = np.repeat(lamp(cube_directions(16)), 3, axis=1)
+    shading, points = shade(sphere(80.0, 2), light, poses, bounce=False)
+
+    def mean_irradiance(normals):
+        return np.maximum(normals @ DIRECTIONS.T, 0.0) @ shading.light_along.mean(1)[:, :1] * 4.0 / len(DIRECTIONS)
+
+    first = normalised(np.cross(points.normals, [0.3, 0.9, 0.1]))
+    change = [
+        (mean_irradiance(normalised(points.normals + step)) - mean_irradiance(normalised(points.normals - step))) / 0.1
+        for step in (0.05 * first, 0.05 * np.cross(points.normals, first))
+    ]
+    expected = np.hypot(*change)
+    assert np.abs(shading.mean_slope()[:, :1] - expected).max() < 0.05 * expected.max()
+    even, _ = shade(sphere(80.0, 2), np.ones((6 * 4**2, 3)), poses, bounce=False)
+    assert even.mean_slope().max() < 0.05
+
+
 def test_reflections_between_key_frames_are_interpolated():
     poses = nods(np.linspace(0.0, 5.0, 6))
     light = np.repeat(lamp(cube_directions(8)), 3, axis=1)

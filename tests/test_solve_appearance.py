@@ -125,6 +125,17 @@ def test_the_fit_stops_where_held_out_frames_stop_improving(matte):
     assert found.held_out > 0.1 > found.fitted
 
 
+def test_a_fit_goes_on_from_a_solution(truth, solution):
+    """From the solution of the same capture: the last resolution alone, in few steps, to the same residual or below."""
+    settings = Settings(resolutions=(4, 8), steps=7, noise=(0.003, 0.01), roughness=0.45)
+    again = fit_appearance(truth[0], settings, start=solution)
+    assert {record["resolution"] for record in again.iterations} == {8}
+    assert len(again.iterations) <= 5
+    assert again.held_out < 1.02 * solution.held_out
+    distrustful = fit_appearance(truth[0], settings, start=replace(solution, trusted=False))
+    assert not distrustful.trusted and again.trusted
+
+
 def test_a_step_that_leads_away_is_undone_and_ends_its_resolution(truth, monkeypatch):
     """The first step that trusts highlights is spoilt: its state may not win, and highlights are not trusted again."""
     from shared.solve import fit_appearance as module

@@ -162,6 +162,9 @@ class PlateShading:
     def mean_irradiance(self):
         return np.mean([self.irradiance(frame) for frame in range(FRAMES)], axis=0)
 
+    def mean_slope(self):
+        return np.zeros((len(self.uvs), 3))
+
     def reflection(self, frame):
         centre = 0.5 + 0.4 * np.array([np.cos(1.1 * frame), np.sin(1.1 * frame)])
         spot = 0.3 * np.exp(-((self.uvs - centre) ** 2).sum(1) / 0.08)

@@ -149,6 +149,12 @@ class AppearanceSolver:
         everywhere = (np.tile(albedo, (count, 1)) for count in (points, nodes))
         return State(log_light, LogLight(resolution), specular, self.settings.roughness, *everywhere)
 
+    def start_from(self, state: State) -> None:
+        """Light, specular intensity and roughness of a state of other points; the albedo is its typical one."""
+        typical, own = np.median(state.albedo, axis=0), self.state
+        albedo, node_albedo = (np.tile(typical, (len(some), 1)) for some in (own.albedo, own.node_albedo))
+        self.state = replace(state, params=state.params.copy(), albedo=albedo, node_albedo=node_albedo)
+
     def _skin(self) -> torch.Tensor:
         return torch.from_numpy(self.capture.skin.astype(np.float32))[None, :, None]
 

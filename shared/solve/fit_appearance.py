@@ -32,7 +32,8 @@ ROUGHNESS_SEARCHES = (2, 1)
 @dataclass(frozen=True)
 class Solution:
     """The best State by held-out residual; iterations: one record per step; fitted and held_out: its residuals; gloss:
-    where roughness varies over the skin, how, and gloss_record what the held-out frames said to that."""
+    where roughness varies over the skin, how, and gloss_record what the held-out frames said to that; trusted: whether
+    highlights took part to the end."""
 
     state: State
     iterations: tuple[dict, ...]
@@ -40,12 +41,17 @@ class Solution:
     held_out: float
     gloss: GlossEquations | None = None
     gloss_record: dict = field(default_factory=dict)
+    trusted: bool = True
 
 
 def fit_appearance(
-    capture: Capture, settings: Settings, report: Callable[[dict], None] = lambda record: None
+    capture: Capture,
+    settings: Settings,
+    report: Callable[[dict], None] = lambda record: None,
+    start: Solution | None = None,
 ) -> Solution:
-    """Fits light, albedo, specular intensity and roughness; report receives each step's record.
+    """Fits light, albedo, specular intensity and roughness; report receives each step's record. start: the solution of
+    a capture much like this one, from which only the last resolution is gone through again.
 
     The first steps only give the light its shape; highlights, which then begin to say something about the scale,
     take part from the fourth, but not again after a step that had to be undone. Only states after the first steps, of
@@ -54,15 +60,19 @@ def fit_appearance(
     solver = AppearanceSolver(capture, settings)
     judges = not capture.fitted.all()  # a clip too short to hold frames out is judged by the fitted ones
     records, best, schedule = [], None, settings.light_schedule
-    trusts = settings.specular
-    for stage, (model, resolution) in enumerate(schedule):
+    trusts, first = settings.specular, 0
+    if start is not None:
+        solver.start_from(start.state)
+        trusts, first = trusts and start.trusted, len(schedule) - 1
+    for stage, (model, resolution) in list(enumerate(schedule))[first:]:
         solver.set_light((model, resolution))
         last, searches = np.inf, 0
         worthwhile = _WORTHWHILE if stage == len(schedule) - 1 else _WORTHWHILE_COARSE
-        least = SHAPING_STEPS + 2 if stage == 0 else 1
+        shaping_steps = min(SHAPING_STEPS, settings.steps - 1) if stage == 0 and start is None else 0
+        least = shaping_steps + 2 if stage == 0 else 1
         kept = None
         for number in range(settings.steps):
-            shaping = stage == 0 and number < min(SHAPING_STEPS, settings.steps - 1)
+            shaping = number < shaping_steps
             record, rise = _step(solver, settings, trusts and not shaping)
             record |= {"light": model, "resolution": resolution, "step": number}
             if kept is not None and rise > _LARGEST_RISE:
@@ -92,7 +102,7 @@ def fit_appearance(
         solver.state = _copy(state)
         solver.set_light((record["light"], record["resolution"]))
         gloss, said = local_roughness(solver)
-    return Solution(state, tuple(records), record["fitted"], record["held_out"], gloss, said)
+    return Solution(state, tuple(records), record["fitted"], record["held_out"], gloss, said, trusts)
 
 
 def _step(solver: AppearanceSolver, settings: Settings, trusts: bool) -> tuple[dict, float]:

@@ -116,7 +116,7 @@ def solve_clip(
         reshaped = reshape(inputs, frames, known, settings.appearance, settings.sizes, settings.shape, progress, note)
         viewer_then = SurfaceViewer(reshaped.mesh, RayScene(reshaped.mesh.vertices, reshaped.mesh.faces))
         scenery_then = set_scenery(viewer_then, settings.sizes, settings.appearance.visibility)
-        then = _solve_light(reshaped, settings, viewer_then, scenery_then, fitted, chart, progress, note)
+        then = _solve_light(reshaped, settings, viewer_then, scenery_then, fitted, chart, progress, note, solution)
         shape_record = judge_shape(solution, then)
         note(f"refined mesh: {shape_record}")
         if shape_record["refined"]:
@@ -176,7 +176,7 @@ def segment_vertices(inputs: InverseInputs, names: tuple[str, ...]) -> np.ndarra
     return found
 
 
-def _solve_light(inputs, settings, viewer, scenery: Scenery, fitted, chart, progress, note) -> Solution:
+def _solve_light(inputs, settings, viewer, scenery: Scenery, fitted, chart, progress, note, start=None) -> Solution:
     chosen, kept = frames_of(inputs, settings, settings.light_frames, fitted)
     skin = segment_vertices(inputs, FACE_SKIN)
     capture = build_capture(
@@ -193,7 +193,7 @@ def _solve_light(inputs, settings, viewer, scenery: Scenery, fitted, chart, prog
         progress=lambda items: progress(items, "tracing visibility"),
     )
     capture = replace(capture, chart=chart)
-    return fit_appearance(capture, settings.appearance, lambda record: note(_describe(record)))
+    return fit_appearance(capture, settings.appearance, lambda record: note(_describe(record)), start)
 
 
 def describe_light(state) -> str:

@@ -29,6 +29,9 @@ IRRADIANCE_ERROR = 0.03
 """Error of the modelled irradiance, relative to the face's mean: bounces, visibility and shape are so good at best.
 In a cavity that gets a tenth of the light it leaves the albedo open by a third."""
 
+NORMAL_ERROR = 0.05
+"""Error of a normal in radians: what a refined mesh still lacks. Where light grazes the skin it passes for albedo."""
+
 POOL = 1.0
 """Texels of a neighbourhood that count as independent for the specular intensity: errors of shape and light are as
 wide as the neighbourhood itself."""

@@ -12,6 +12,7 @@ from shared.shading import VertexShading
 from shared.solve.capture import spread_frames
 from shared.solve.texture import (
     IRRADIANCE_ERROR,
+    NORMAL_ERROR,
     PRIOR_SPREAD,
     Noise,
     NormalEquations,
@@ -59,8 +60,9 @@ class TexturePass:
     ):
         self.surface, self.viewer, self.shading, self.clip = surface, viewer, shading, clip
         self.typical_albedo = typical_albedo
-        mean = surface.interpolate(shading.mean_irradiance())
-        self.systematic = np.square(IRRADIANCE_ERROR * np.median(mean, axis=0) / np.maximum(mean, 1e-6))
+        mean = np.maximum(surface.interpolate(shading.mean_irradiance()), 1e-6)
+        turned = NORMAL_ERROR * surface.interpolate(shading.mean_slope()) / mean
+        self.systematic = np.square(IRRADIANCE_ERROR * np.median(mean, axis=0) / mean) + np.square(turned)
         self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), progress
 
     def run(self, widths: tuple[float, ...]) -> tuple[TexelMaterial, dict]:
