@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from shared.geometry import project, rigid, rotation_from_vector
+from shared.solve import track_head
 from shared.solve.first_poses import interpolate_poses
 from shared.solve.pose_trust import rotations_apart
 from shared.solve.track_head import carried_poses, follow_landmarks
@@ -82,3 +83,16 @@ def test_steady_motion_is_interpolated_not_followed():
     shaken = replace(clip, landmarks_px=clip.landmarks_px + np.random.default_rng(0).normal(0, 1.0, (17, 468, 2)))
     straight = interpolate_poses(poses[known], clip.time_s[known], clip.time_s)
     assert np.abs(follow_landmarks(shaken, named, poses[known], known) - straight).max() < 1e-12
+
+
+def test_a_pose_that_its_landmarks_contradict_is_not_followed(monkeypatch):
+    """Among gross outliers the robust estimate can end anywhere."""
+    named = landmark_model()
+    clip, poses = stopping_clip(named, frames=17)
+    known = np.zeros(clip.count, bool)
+    known[::8] = True
+    honest = track_head.landmark_poses(clip, named)
+    lost = rigid(rotation_from_vector(np.array([0.1, 0.3, 0.0])) @ honest[5][:3, :3], honest[5][:3, 3])
+    monkeypatch.setattr(track_head, "landmark_poses", lambda *_: [*honest[:5], lost, *honest[6:]])
+    straight = interpolate_poses(poses[known], clip.time_s[known], clip.time_s)
+    assert np.abs(follow_landmarks(clip, named, poses[known], known) - straight).max() < 1e-12

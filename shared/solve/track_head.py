@@ -147,7 +147,8 @@ def follow_landmarks(clip: TrackedClip, named: np.ndarray, poses: np.ndarray, kn
 
     Between known frames motion is interpolated. Where a frame's landmarks say that the head was elsewhere by more than
     FOLLOW_TEXELS of the coarse pass, its pose is theirs instead, with their bias as it is in the known frames around:
-    a head that starts or stops at once leaves the interpolation's path by more than tracks can be searched.
+    a head that starts or stops at once leaves the interpolation's path by more than tracks can be searched. Landmarks
+    full of outliers can give any pose: most of them must lie nearer to it than to the interpolated one.
     named [468, 3]: landmarks on the head, NaN where the model has none.
     """
     between = interpolate_poses(poses, clip.time_s[known], clip.time_s)
@@ -161,10 +162,12 @@ def follow_landmarks(clip: TrackedClip, named: np.ndarray, poses: np.ndarray, kn
     bias = interpolate_poses(bias, clip.time_s[both], clip.time_s)
     for i in np.nonzero(~known)[0]:
         if seen[i] is not None:
-            followed = seen[i] @ bias[i]
-            pixels = project(named[usable], np.stack([between[i], followed]), clip.intrinsics)[0]
-            if np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)) > limit_px:
-                between[i] = followed
+            expected = between[i] @ np.linalg.inv(bias[i])
+            pixels = project(named[usable], np.stack([expected, seen[i]]), clip.intrinsics)[0]
+            apart = np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1))
+            misses = np.median(np.linalg.norm(pixels - clip.landmarks_px[i, usable], axis=2), axis=1)
+            if apart > limit_px and misses[1] < misses[0]:
+                between[i] = seen[i] @ bias[i]
     return between
 
 
