@@ -41,11 +41,12 @@ def random_frames(texels, frames=7, seed=0):
     return irradiance, reflection, colours, weight
 
 
-def accumulated(irradiance, reflection, colours, weight):
+def accumulated(irradiance, reflection, colours, weight, limits=None):
     equations = NormalEquations(irradiance.shape[1], NOISE)
+    limits = np.zeros(colours.shape, np.int8) if limits is None else limits
     for f in range(len(irradiance)):
         rows = np.nonzero(weight[f] > 0)[0]
-        samples = TexelSamples(rows, colours[f, rows], weight[f, rows], np.zeros((len(rows), 3), np.int8))
+        samples = TexelSamples(rows, colours[f, rows], weight[f, rows], limits[f, rows])
         equations.add(samples, irradiance[f, rows], reflection[f, rows], np.ones((len(rows), 3)))
     return equations
 
@@ -95,6 +96,19 @@ def test_information_grows_with_frames():
     # Errors that all frames share cannot be averaged away.
     shared = accumulated(*frames).information(np.full(3, 0.9), NEVER_WRONG + 0.04)
     assert (shared < 25.0).all() and np.allclose(1.0 / shared, 1.0 / every + 0.04)
+
+
+def test_what_is_left_of_a_mostly_clipped_texel_says_little():
+    """The few samples of red that are not clipped are its darkest: worth less than the same few seen alone."""
+    frames = random_frames(10, frames=8)
+    frames[3][:] = 1.0
+    limits = np.zeros(frames[2].shape, np.int8)
+    limits[:6, :, 0] = 1
+    found = accumulated(*frames, limits).information(np.full(3, 0.9), NEVER_WRONG)
+    alone = accumulated(*(x[6:] for x in frames)).information(np.full(3, 0.9), NEVER_WRONG)
+    whole = accumulated(*frames).information(np.full(3, 0.9), NEVER_WRONG)
+    assert (found[:, 0] < 0.5 * alone[:, 0]).all()
+    assert np.allclose(found[:, 1:], whole[:, 1:])
 
 
 def test_robust_weights():

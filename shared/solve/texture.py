@@ -1,7 +1,7 @@
 """Albedo and specular intensity per texel, from all frames, in closed form.
 
 Frames stream through: each adds its share to every texel's normal equations, so memory depends on the map's size
-alone (88 bytes per texel). With the light, the roughness and the geometry given, a texel's radiance is linear in its
+alone (100 bytes per texel). With the light, the roughness and the geometry given, a texel's radiance is linear in its
 albedo a [3] and its specular intensity s:  I = a E + s S. A second pass over the frames weighs each sample by how well
 the first pass's result explains it (Cauchy), which leaves out hair, blinks and what slid by.
 
@@ -63,11 +63,12 @@ class NormalEquations:
     """Sums over frames per texel and channel of weighted products of E, S and the colour I.
 
     sums [T, 18]: EE, ES, EI, SS and SI side by side, then EE of the samples that are neither clipped nor crushed, three
-    channels each, so that a frame is added in one go.
+    channels each, so that a frame is added in one go; clipped_ee [T, 3]: EE of clipped samples, satisfied or not.
     """
 
     def __init__(self, texels: int, noise: Noise):
         self.noise, self.sums = noise, np.zeros((texels, 18), np.float32)
+        self.clipped_ee = np.zeros((texels, 3), np.float32)
         columns = (self.sums[:, 3 * k : 3 * k + 3] for k in range(6))
         self.ee, self.es, self.ei, self.ss, self.si, self.measured_ee = columns
 
@@ -79,6 +80,10 @@ class NormalEquations:
         share.append(share[0] * (samples.limits == 0))
         rows, share = torch.from_numpy(samples.rows), torch.from_numpy(np.concatenate(share, axis=1, dtype=np.float32))
         torch.from_numpy(self.sums).index_add_(0, rows, share)
+        clipped = np.nonzero((samples.limits > 0).any(1))[0]
+        weight = samples.weight[clipped, None] * self.noise.precision(samples.colours[clipped])
+        lost = weight * np.square(irradiance[clipped]) * (samples.limits[clipped] > 0)
+        self.clipped_ee[samples.rows[clipped]] += lost  # a frame shows a texel once
 
     def solve_albedo(self, specular: np.ndarray, fallback: np.ndarray, pull: float | np.ndarray) -> np.ndarray:
         """Albedo [T, 3] for given specular [T]; fallback [T, 3] acts with precision pull, a number or [T, 3]."""
@@ -93,12 +98,13 @@ class NormalEquations:
     def information(self, typical_albedo: np.ndarray, systematic: np.ndarray) -> np.ndarray:
         """[T, 3] precision of the log albedo per channel, with correlated frames taken together.
 
-        A clipped sample only says "at least so much": it moves the albedo but measures nothing. Where little light
-        arrives a small error makes a large albedo: typical_albedo [3] bounds what counts; systematic [T, 3]: variance
+        A clipped sample only says "at least so much": it moves the albedo but measures nothing, and what is not clipped
+        of a texel that mostly is are its darkest samples, which say too little. Where little light arrives a small error makes a large albedo: typical_albedo [3] bounds what counts; systematic [T, 3]: variance
         that all frames share.
         """
         albedo = np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)
-        return 1.0 / (systematic + CORRELATED_FRAMES / np.maximum(self.measured_ee * albedo**2, 1e-9))
+        spared = self.measured_ee / np.maximum(self.measured_ee + self.clipped_ee, 1e-9)
+        return 1.0 / (systematic + CORRELATED_FRAMES / np.maximum(spared**2 * self.measured_ee * albedo**2, 1e-9))
 
 
 def robust_weight(
