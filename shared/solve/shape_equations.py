@@ -84,8 +84,10 @@ def point_equations(
     specular: float | np.ndarray,
     fitted: np.ndarray,
     settings: EquationSettings,
+    share: float = 1.0,
 ) -> PointEquations:
-    """Equations of P points [P, 3] with normals [P, 3]; specular: intensity, one or [P]; fitted [F] bool."""
+    """Equations of P points [P, 3] with normals [P, 3]; specular: intensity, one or [P]; fitted [F] bool; share: how
+    many independent points one counts as, where they are denser than the pictures resolve."""
     specular = np.broadcast_to(np.asarray(specular, np.float32), (len(points),))[:, None, None]
     gloss = specular * terms.reflection
     albedo, weight = _fit_albedo(samples, terms.irradiance, gloss, fitted, settings.noise)
@@ -107,7 +109,7 @@ def point_equations(
     error -= terms.irradiance * ((weighted * error).sum(1) / power)[:, None]
     count = np.maximum((weight > 0).sum(), 1)
     misfit = max(1.0, float((weight * error**2).sum() / count))
-    evidence = 1.0 / (misfit * settings.correlated)
+    evidence = share / (misfit * settings.correlated)
     rows = slopes.reshape(len(slopes), -1, 3)
     scaled = rows * (evidence * weight).reshape(len(slopes), -1, 1)
     hessian = np.swapaxes(scaled, 1, 2) @ rows
