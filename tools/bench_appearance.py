@@ -48,6 +48,8 @@ CASES: dict[str, dict] = {
     "harmonics_2": {"light_model": "harmonics_2"},
     "harmonics_4": {"light_model": "harmonics_4"},
     "sun_sky": {"light_model": "sun_sky"},
+    "camera_light": {"light_model": "camera"},
+    "three_frames": {"fit_frames": 3},
     "no_chart": {"chart": False},
 }
 CONFIDENT = 0.5

@@ -2,12 +2,14 @@
 
     python -m tools.bench_reference SUBJECT RUN OUT --solve reference [--minutes 5] [--set key=value ...]
     python -m tools.bench_reference SUBJECT RUN OUT --solve transfer [--set key=value ...]
+    python -m tools.bench_reference SUBJECT RUN OUT --solve compared [--sizes small] [--set key=value ...]
     python -m tools.bench_reference SUBJECT RUN OUT --chart
 
 SUBJECT: a folder with gt/; RUN: a run's folder whose work/ holds sample_frames and track_landmarks. True mesh and poses
 unless --tracked. --solve adds rows to OUT/accuracy.csv: the median dE2000 of the albedo on the face skin after one gain
 per channel, its PSNR, and processor seconds of the solver alone. The reference solver stops after --minutes and goes on
-from its checkpoint when called again with the same settings and --label; the transfer solver is run at several sizes.
+from its checkpoint when called again with the same settings and --label; the transfer solver is run at several sizes;
+"compared" runs it with the models of other methods.
 --chart writes OUT/accuracy.svg and says how much sooner the transfer solver reaches the reference's last error.
 """
 
@@ -31,29 +33,33 @@ from tools.bench_appearance import map_errors, open_clip, settings_of
 from tools.svg_file import save_line_chart
 
 FIELDS = ("label", "solver", "size", "seconds", "iteration", "delta_e2000_median", "delta_e2000_p90", "psnr_linear")
+FIXED_SHAPE = {"shape": False, "local_roughness": False}
 TRANSFER_SIZES: dict[str, dict] = {
     "least": {
-        "points": 300,
-        "directions": 192,
-        "bounce_nodes": 100,
-        "light_resolution": 8,
-        "light_frames": 10,
-        "light_steps": 4,
-        "map_size": 128,
-        "search_roughness": False,
+        "points": 300, "directions": 192, "bounce_nodes": 100, "light_resolution": 8, "light_frames": 10,
+        "light_steps": 4, "map_size": 128, "search_roughness": False, **FIXED_SHAPE,
     },
     "small": {
-        "points": 800,
-        "directions": 384,
-        "bounce_nodes": 250,
-        "light_resolution": 8,
-        "light_frames": 16,
-        "light_steps": 8,
-        "map_size": 256,
+        "points": 800, "directions": 384, "bounce_nodes": 250, "light_resolution": 8, "light_frames": 16,
+        "light_steps": 8, "map_size": 256, **FIXED_SHAPE,
     },
-    "draft": {"points": 2000, "directions": 512, "bounce_nodes": 600, "light_resolution": 8, "map_size": 512},
+    "draft": {
+        "points": 2000, "directions": 512, "bounce_nodes": 600, "light_resolution": 8, "map_size": 512, **FIXED_SHAPE,
+    },
+    "fixed": FIXED_SHAPE,
     "standard": {},
+}  # fmt: skip
+"""From a few seconds to the defaults; all but the last leave the mesh as it is."""
+COMPARED: dict[str, dict] = {
+    "full model": {},
+    "no bounce": {"bounce": False},
+    "no visibility": {"visibility": False},
+    "matte": {"specular": False},
+    "sun and sky": {"light_model": "sun_sky"},
+    "lamp at the camera": {"light_model": "camera"},
+    "three frames": {"fit_frames": 3},
 }
+"""The models that other methods use, as settings."""
 SCORED_GROWTH = 1.35
 """The reference is scored after 5 iterations and then whenever they have grown by this factor."""
 
@@ -88,7 +94,8 @@ class _Scored:
 
     def __init__(self, log: Log, label: str, subject: Path, inputs, index: np.ndarray, minutes: float):
         before = [row for row in log.rows() if row["label"] == label]
-        self.spent = max((row["seconds"] for row in before), default=0.0)
+        self.clock = log.path.with_name(f"{label}.seconds")
+        self.spent = float(self.clock.read_text()) if before and self.clock.exists() else 0.0
         self.next = max([5.0] + [SCORED_GROWTH * row["iteration"] for row in before])
         self.log, self.label, self.subject, self.inputs, self.index = log, label, subject, inputs, index
         self.limit, self.began, self.paused = 60.0 * minutes, time.process_time(), 0.0
@@ -109,7 +116,8 @@ class _Scored:
             )
         }
         maps["confidence"] = np.ones(maps["roughness"].shape, np.float32)
-        errors = map_errors(self.subject, self.inputs, self.index, maps)
+        mesh = solver.mesh.replace(vertices=solver.vertices().detach().cpu().double().numpy())
+        errors = map_errors(self.subject, self.inputs, self.index, mesh, maps)
         row = {
             "label": self.label,
             "solver": "reference",
@@ -125,8 +133,10 @@ class _Scored:
         """Ends the iterations when the minutes are over, right after a checkpoint."""
         for i, item in enumerate(items):
             yield item
-            if label == "reference iterations" and (i + 1) % 10 == 0 and self.seconds() - self.spent > self.limit:
-                raise _Enough
+            if label == "reference iterations" and (i + 1) % 10 == 0:
+                self.clock.write_text(f"{self.seconds():.3f}")
+                if self.seconds() - self.spent > self.limit:
+                    raise _Enough
 
 
 def solve_reference(options, inputs, index: np.ndarray, changes: dict, log: Log) -> None:
@@ -153,12 +163,20 @@ def solve_transfer(options, inputs, index: np.ndarray, changes: dict, log: Log) 
         )
         row = {"label": options.label, "solver": "transfer", "size": size, "seconds": time.process_time() - began}
         steps = len(result.solution.iterations)
-        log.add(row | {"iteration": steps} | map_errors(options.subject, inputs, index, result.maps))
+        errors = map_errors(options.subject, inputs, index, result.viewer.mesh, result.maps)
+        log.add(row | {"iteration": steps} | errors)
+
+
+def solve_compared(options, inputs, index: np.ndarray, changes: dict, log: Log) -> None:
+    """The transfer solver with each of the models of other methods."""
+    for name, model in COMPARED.items():
+        options.label = name
+        solve_transfer(options, inputs, index, {**changes, **model}, log)
 
 
 def chart(log: Log, path: Path) -> None:
     """Error over the logarithm of time, and the ratio of times at the reference's best error."""
-    rows = log.rows()
+    rows = [row for row in log.rows() if row["label"] not in COMPARED]
     labels = list(dict.fromkeys(row["label"] for row in rows))
     times = np.unique([row["seconds"] for row in rows])
     curves = {}
@@ -195,7 +213,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("run", type=Path)
     parser.add_argument("out", type=Path)
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--solve", choices=("reference", "transfer"))
+    what.add_argument("--solve", choices=("reference", "transfer", "compared"))
     what.add_argument("--chart", action="store_true")
     parser.add_argument("--label", help="name of the curve (default: the solver)")
     parser.add_argument("--tracked", action="store_true", help="tracked mesh and poses instead of the true ones")
@@ -210,7 +228,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     inputs, index = open_clip(options.subject, options.run, options.tracked)
     changes = dict(setting.split("=", 1) for setting in options.set)
-    solve = solve_reference if options.solve == "reference" else solve_transfer
+    solve = {"reference": solve_reference, "transfer": solve_transfer, "compared": solve_compared}[options.solve]
     solve(options, inputs, index, changes, log)
     return 0
 

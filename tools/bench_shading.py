@@ -2,8 +2,9 @@
 
     python -m tools.bench_shading OUT [--samples 256] [--pixels 96] [--mesh head statue] [--light window]
 
-Writes   OUT/shading.csv (one row per mesh, quantity and roughness), OUT/specular_error.svg, and one EXR of ours, theirs
-         and their ratio per row under OUT/pictures.
+Writes   OUT/shading.csv (one row per mesh, quantity and roughness), OUT/specular_MESH.svg, and one EXR of ours, theirs
+         and their ratio per row under OUT/pictures. split_sum and direction_sum are the transfer solver's two ways of
+         making a lobe, published_* the reference solver's renderer.
 Compares radiance of the pixels that the mesh fills. mean: ratio of the sums, minus one. rms: root mean square error
          over the mean radiance; two renders with seeds of their own take the path tracer's noise out of it.
 Needs    pip install mitsuba.
@@ -20,6 +21,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from shared.envmap import cube_from_latlong, latlong_from_cube
 from shared.gather import SurfaceViewer
@@ -31,6 +33,8 @@ from shared.raycast import RayScene
 from shared.render import SurfaceMaps, render_frame
 from shared.shading import light_along
 from shared.solve.capture import Scenery, Sizes, face_front, set_scenery
+from shared.solve.reference_raster import Raster
+from shared.solve.reference_shade import Sampling, Shader, Texture
 from shared.solve.views import Camera, orbit_camera
 from shared.studio_lights import STUDIO_LIGHTS, studio_light
 from shared.transfer import Transfer, irradiance, mesh_points, node_radiosity
@@ -43,6 +47,9 @@ ROUGHNESSES = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 YAW_DEG, PITCH_DEG = -20.0, 8.0
 LIGHT_RESOLUTION, LATLONG_ROWS = 16, 512
 SIZES = Sizes(directions=768, nodes=1000)
+PUBLISHED_RESOLUTION, PUBLISHED_SAMPLES, SPLIT_SAMPLES = 64, 1024, 256
+GLOSS_SHARE = 8
+"""The path tracer's paths with our lobe, which runs in Python, are so much fewer."""
 LARGEST_SHOWN = 60.0
 """Percent: where lobes slip between the directions, the sum over them says nothing."""
 
@@ -106,6 +113,26 @@ class Stage:
         towards = normalised(-camera[:3, 3] @ camera[:3, :3] - points.positions)
         return self._picture(None, specular_reflection(table, towards, roughness, self.along), (0.0, 0.0, 0.0))
 
+    def published(self, coat: Coat, samples: int, seed: int = 0) -> np.ndarray:
+        """Picture by the reference solver's renderer: pixel centres, rays of its own for V and V~."""
+        mesh, camera, view = self.viewer.mesh, self.camera, torch.from_numpy
+        raster = Raster(mesh, camera.intrinsics, camera.size)
+        hits = raster.hits(self.viewer.scene, camera.camera_from_head)
+        pixels = np.nonzero(hits.face.ravel() >= 0)[0]
+        vertices, normals = (view(x.astype(np.float32)) for x in (mesh.vertices, self.viewer.normals))
+        points = raster.points(vertices, normals, camera.camera_from_head, pixels, hits.face.ravel()[pixels])
+        shader = Shader(PUBLISHED_RESOLUTION, Sampling(samples, samples, SPLIT_SAMPLES))
+        even = torch.ones(len(pixels))
+        texture = Texture(
+            torch.tensor(coat.albedo).expand(len(pixels), 3), coat.specular_intensity * even, coat.roughness * even
+        )
+        light = view(cube_from_latlong(self.latlong, PUBLISHED_RESOLUTION))
+        picture = np.zeros((camera.size[0] * camera.size[1], 3), np.float32)
+        generator = torch.Generator().manual_seed(seed)
+        with torch.no_grad():
+            picture[pixels] = shader(light, points, texture, self.viewer.scene, np.eye(3), generator).numpy()
+        return picture.reshape(*camera.size[::-1], 3)
+
     def _picture(self, diffuse: np.ndarray | None, specular: np.ndarray | None, albedo: Sequence[float]) -> np.ndarray:
         values = [np.zeros((len(self.viewer.mesh.vertices), 3), np.float32) for _ in range(2)]
         for target, found in zip(values, (diffuse, specular), strict=True):
@@ -157,7 +184,13 @@ def head() -> Mesh:
 MESHES: dict[str, Callable[[], Mesh]] = {"head": head, "statue": statue}
 
 
-def measure(name: str, stage: Stage, samples: int, keep: Callable[[str, np.ndarray, np.ndarray], None]) -> list[dict]:
+def measure(
+    name: str,
+    stage: Stage,
+    samples: int,
+    keep: Callable[[str, np.ndarray, np.ndarray], None],
+    roughnesses: Sequence[float] = ROUGHNESSES,
+) -> list[dict]:
     """Rows of one mesh; keep(label, ours, theirs) may save the pictures."""
     rows, filled = [], stage.filled()
 
@@ -167,27 +200,30 @@ def measure(name: str, stage: Stage, samples: int, keep: Callable[[str, np.ndarr
         errors = compare(ours, theirs, filled)
         rows.append({"mesh": name, "quantity": quantity, "roughness": roughness, "pixels": int(filled.sum())} | errors)
 
-    for bounces, depth in enumerate((DIRECT, ONE_BOUNCE, ALL_BOUNCES)):
-        label = ("diffuse_direct", "diffuse_one_bounce", "diffuse_all_bounces")[bounces]
-        row(label, stage.diffuse(SKIN, bounces), stage.truth(Coat(SKIN), depth, samples))
-    for roughness in ROUGHNESSES:
-        theirs = stage.truth(Coat((0.0, 0.0, 0.0), 1.0, roughness), DIRECT, samples)
-        for way, split in (("split_sum", True), ("direction_sum", False)):
-            row(way, stage.specular(roughness, split), theirs, roughness)
+    direct = stage.truth(Coat(SKIN), DIRECT, samples)
+    row("diffuse_direct", stage.diffuse(SKIN, 0), direct)
+    published = [stage.published(Coat(SKIN), PUBLISHED_SAMPLES, seed) for seed in (1, 2)]
+    row("published_diffuse", published[0], direct)
+    row("diffuse_direct_against_published", stage.diffuse(SKIN, 0), tuple(published))
+    row("diffuse_one_bounce", stage.diffuse(SKIN, 1), stage.truth(Coat(SKIN), ONE_BOUNCE, samples))
+    row("diffuse_all_bounces", stage.diffuse(SKIN, 2), stage.truth(Coat(SKIN), ALL_BOUNCES, samples))
+    for roughness in roughnesses:
+        coat = Coat((0.0, 0.0, 0.0), 1.0, roughness)
+        theirs = stage.truth(coat, DIRECT, max(2, samples // GLOSS_SHARE))
+        row("split_sum", stage.specular(roughness, True), theirs, roughness)
+        row("direction_sum", stage.specular(roughness, False), theirs, roughness)
+        row("published_split_sum", stage.published(coat, 1), theirs, roughness)
     return rows
 
 
 def chart(path: Path, rows: list[dict]) -> None:
-    """Root mean square error of both ways over roughness, one curve per mesh and way."""
+    """Root mean square error of the highlights over roughness, one curve per way; rows of one mesh."""
     curves = {}
-    for mesh in dict.fromkeys(row["mesh"] for row in rows):
-        for way in ("split_sum", "direction_sum"):
-            chosen = [row for row in rows if row["mesh"] == mesh and row["quantity"] == way]
-            percent = np.array([100.0 * float(row["rms"]) for row in chosen])
-            curves[f"{mesh}, {way.replace('_', ' ')}"] = np.where(percent < LARGEST_SHOWN, percent, np.nan)
-    save_line_chart(
-        path, ROUGHNESSES, curves, x_label="roughness", y_label="rms error of the highlight, %", from_zero=True
-    )
+    for way in ("split_sum", "direction_sum", "published_split_sum"):
+        percent = np.array([100.0 * float(row["rms"]) for row in rows if row["quantity"] == way])
+        curves[way.replace("_", " ")] = np.where(percent < LARGEST_SHOWN, percent, np.nan)
+    options = {"x_label": "roughness", "y_label": "rms error of the highlight, %", "from_zero": True}
+    save_line_chart(path, ROUGHNESSES, curves, **options)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -216,17 +252,15 @@ def main(arguments: list[str] | None = None) -> int:
     for name in options.mesh:
         sizes = replace(SIZES, directions=options.directions)
         stage = Stage.of(MESHES[name](), studio_light(options.light), options.pixels, sizes)
-        rows += measure(name, stage, options.samples, keep)
-        for row in rows[-len(ROUGHNESSES) * 2 - 3 :]:
-            print(
-                " ".join(f"{value:.4f}" if isinstance(value, float) else str(value) for value in row.values()),
-                flush=True,
-            )
+        own = measure(name, stage, options.samples, keep)
+        for row in own:
+            print(" ".join(f"{v:.4f}" if isinstance(v, float) else str(v) for v in row.values()), flush=True)
+        chart(options.out / f"specular_{name}.svg", own)
+        rows += own
     with open(options.out / "shading.csv", "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
         writer.writerows(rows)
-    chart(options.out / "specular_error.svg", rows)
     return 0
 
 
