@@ -98,9 +98,10 @@ class NormalEquations:
     def information(self, typical_albedo: np.ndarray, systematic: np.ndarray) -> np.ndarray:
         """[T, 3] precision of the log albedo per channel, with correlated frames taken together.
 
-        A clipped sample only says "at least so much": it moves the albedo but measures nothing, and what is not clipped
-        of a texel that mostly is are its darkest samples, which say too little. Where little light arrives a small error makes a large albedo: typical_albedo [3] bounds what counts; systematic [T, 3]: variance
-        that all frames share.
+        A clipped sample only says "at least so much": it moves the albedo but measures nothing, and what is not
+        clipped of a texel that mostly is are its darkest samples, which say too little. Where little light arrives a
+        small error makes a large albedo: typical_albedo [3] bounds what counts; systematic [T, 3]: variance that all
+        frames share.
         """
         albedo = np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)
         spared = self.measured_ee / np.maximum(self.measured_ee + self.clipped_ee, 1e-9)

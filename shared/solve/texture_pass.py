@@ -118,14 +118,27 @@ class TexturePass:
         return TexelMaterial(albedo, specular, information.min(1))
 
     def _surroundings(self, rough: np.ndarray, information: np.ndarray) -> np.ndarray:
-        """[V, 3] log albedo as a smooth field: texels that the clip tells little of follow those that it knows."""
+        """[V, 3] log albedo as a smooth field: texels that the clip tells little of follow those that it knows.
+
+        Brightness and colour are smooth each for itself, both relative to the person's typical skin: a channel that is
+        clipped everywhere takes its brightness from the others that are not, its tint from where all are known.
+        """
+        typical = np.log(np.maximum(self.typical_albedo, 1e-3))
+        relative = np.log(np.maximum(rough, 1e-3)) - typical
         precision = np.minimum(information, NEIGHBOUR_STEP**-2)
-        log_albedo, total = self.surface.to_vertices(np.log(np.maximum(rough, 1e-3)), precision)
+        total = np.maximum(precision.sum(1, keepdims=True), 1e-12)
+        brightness = (precision * relative).sum(1, keepdims=True) / total
+        tint_precision = precision * (total - precision) / total
+        return typical + self._field(brightness, total) + self._field(relative - brightness, tint_precision)
+
+    def _field(self, values: np.ndarray, precision: np.ndarray) -> np.ndarray:
+        """Texel values [T, C] of some precision [T, C] -> the smooth field [V, C] through them; 0 far from any."""
+        means, total = self.surface.to_vertices(values, precision)
         share, _ = self.surface.to_vertices(precision, np.ones_like(precision))
-        mean = np.log(np.maximum(self.typical_albedo, 1e-3))
         # What leaves a texel as open as the prior does is mostly a model's error that its neighbours share.
         known = np.where(total > 0.0, share**2 / (share + PRIOR_SPREAD**-2), 0.0)
-        return smooth_field(self.surface.mesh, log_albedo, known, mean, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD)
+        centre = np.zeros(values.shape[1])
+        return smooth_field(self.surface.mesh, means, known, centre, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD)
 
     def held_out_errors(self, candidates: list[TexelMaterial]) -> list[float]:
         """Root mean square residual of each candidate on the held-out frames (linear, censored, trust-weighted)."""
