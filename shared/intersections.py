@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.mesh import vertex_adjacency
+from shared.mesh import face_normals, vertex_adjacency
 from shared.raycast import RayScene
 
 _ENDS = 1e-3
 """Share of an edge at both ends that is not followed: there the faces around it begin."""
 _MOST_HALVINGS = 4
+_LEAST_AREA = 0.02
 
 
 def crossing_edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -33,21 +34,30 @@ def crossing_edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return edges[found]
 
 
-def move_without_crossing(start: np.ndarray, wanted: np.ndarray, faces: np.ndarray, rings: int = 2) -> np.ndarray:
-    """Vertices [V, 3] as near to wanted as goes without crossings that start did not have.
+def turned_faces(start: np.ndarray, moved: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[F] bool: faces that the move from start to moved [V, 3] turns over or shrinks to next to nothing."""
+    before, after = face_normals(start, faces), face_normals(moved, faces)
+    return (before * after).sum(1) < _LEAST_AREA * (before * before).sum(1)
 
-    Where moved faces cross, the move of the vertices around is halved, at last undone.
+
+def move_without_crossing(start: np.ndarray, wanted: np.ndarray, faces: np.ndarray, rings: int = 2) -> np.ndarray:
+    """Vertices [V, 3] as near to wanted as goes without crossings that start did not have and without turned faces.
+
+    Where moved faces cross, turn over or lose nearly all area, the move of the vertices around is halved, at last
+    undone.
     """
     before = {tuple(edge) for edge in crossing_edges(start, faces)}
     adjacency = vertex_adjacency(faces, len(start))
     share = np.ones(len(start))
     for attempt in range(_MOST_HALVINGS + 1):
         placed = start + share[:, None] * (wanted - start)
-        bad = [edge for edge in map(tuple, crossing_edges(placed, faces)) if edge not in before]
-        if not bad:
+        crossing = [edge for edge in map(tuple, crossing_edges(placed, faces)) if edge not in before]
+        turned = turned_faces(start, placed, faces)
+        if not crossing and not turned.any():
             return placed
         around = np.zeros(len(start))
-        around[np.ravel(bad)] = 1.0
+        around[np.array(crossing, int).ravel()] = 1.0
+        around[faces[turned].ravel()] = 1.0
         for _ in range(rings + attempt):
             around = np.maximum(around, (adjacency @ around > 0) * 1.0)
         share = np.where(around > 0, 0.5 * share if attempt < _MOST_HALVINGS - 1 else 0.0, share)
