@@ -31,6 +31,7 @@ LARGEST_RESULT_LIGHT = 64
 SAMPLE_SPREAD = 0.04
 """Relative standard deviation of one sample: what the confidence map counts with."""
 REPORT_EVERY = 50
+SCALE = "priors on skin and white light where the descent starts, which nothing holds it to"
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,7 @@ def conclude(inputs, settings, solver: ReferenceSolver, average: Average, fitted
     shading = shade_vertices(inputs, appearance, viewer, scenery, solution, progress)
     record = {
         "texture": {"held_out": {"per texel": held}, "chosen": "per texel"},
-        "albedo_scale": describe_scale(None, np.median(state.albedo, axis=0)),
+        "albedo_scale": describe_scale(None, np.median(state.albedo, axis=0)) | {"method": SCALE},
         "warnings": [],
     }
     return InverseResult(solution, material, maps, shading, viewer, fitted, record)
