@@ -97,12 +97,18 @@ def fit_appearance(
                 break
             last = judged
     _, record, state = best
-    gloss, said = None, {}
-    if settings.specular and settings.local_roughness:
-        solver.state = _copy(state)
-        solver.set_light((record["light"], record["resolution"]))
-        gloss, said = local_roughness(solver)
-    return Solution(state, tuple(records), record["fitted"], record["held_out"], gloss, said, trusts)
+    return Solution(state, tuple(records), record["fitted"], record["held_out"], trusted=trusts)
+
+
+def with_local_roughness(capture: Capture, settings: Settings, solution: Solution) -> Solution:
+    """The solution of a capture with roughness that varies over the skin, where that serves."""
+    if not (settings.specular and settings.local_roughness):
+        return solution
+    solver = AppearanceSolver(capture, settings)
+    solver.state = _copy(solution.state)
+    solver.set_light((settings.light_model, solution.state.light_model.resolution))
+    gloss, said = local_roughness(solver)
+    return replace(solution, gloss=gloss, gloss_record=said)
 
 
 def _step(solver: AppearanceSolver, settings: Settings, trusts: bool) -> tuple[dict, float]:

@@ -13,7 +13,7 @@ from shared.gather import Picture, SurfaceViewer
 from shared.mesh import Mesh
 from shared.raycast import RayScene
 from shared.shading import Material, VertexShading
-from shared.solve.appearance import Settings
+from shared.solve.appearance import Capture, Settings
 from shared.solve.capture import (
     Scenery,
     Sizes,
@@ -24,7 +24,7 @@ from shared.solve.capture import (
     spread_frames,
 )
 from shared.solve.chart_scale import describe_scale, doubt_scale, state_chart
-from shared.solve.fit_appearance import Solution, fit_appearance
+from shared.solve.fit_appearance import Solution, fit_appearance, with_local_roughness
 from shared.solve.frame_choice import covering_frames
 from shared.solve.reference_settings import ReferenceSettings
 from shared.solve.reshape import reshape
@@ -108,7 +108,7 @@ def solve_clip(
     scenery = set_scenery(viewer, settings.sizes, settings.appearance.visibility)
     moves = settings.appearance.light_moves(inputs.moves)
     chart, warning = state_chart(sights, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves)
-    solution = _solve_light(inputs, settings, viewer, scenery, fitted, chart, progress, note)
+    solution, capture = _solve_light(inputs, settings, viewer, scenery, fitted, chart, progress, note)
     shape_record = {"refined": False}
     if settings.shape is not None and inputs.face_segment is not None:
         known = Reflectance.of(solution, scenery)
@@ -116,11 +116,14 @@ def solve_clip(
         reshaped = reshape(inputs, frames, known, settings.appearance, settings.sizes, settings.shape, progress, note)
         viewer_then = SurfaceViewer(reshaped.mesh, RayScene(reshaped.mesh.vertices, reshaped.mesh.faces))
         scenery_then = set_scenery(viewer_then, settings.sizes, settings.appearance.visibility)
-        then = _solve_light(reshaped, settings, viewer_then, scenery_then, fitted, chart, progress, note, solution)
+        more = viewer_then, scenery_then, fitted, chart, progress, note, solution
+        then, capture_then = _solve_light(reshaped, settings, *more)
         shape_record = judge_shape(solution, then)
         note(f"refined mesh: {shape_record}")
         if shape_record["refined"]:
-            inputs, viewer, scenery, solution = reshaped, viewer_then, scenery_then, then
+            inputs, viewer, scenery = reshaped, viewer_then, scenery_then
+            solution, capture = then, capture_then
+    solution = with_local_roughness(capture, settings.appearance, solution)
     shading = shade_vertices(inputs, settings.appearance, viewer, scenery, solution, progress)
     surface = TexelSurface(inputs.mesh, settings.map_size)
     clip = Clip(inputs.picture, inputs.camera_from_head, inputs.intrinsics, fitted)
@@ -176,7 +179,9 @@ def segment_vertices(inputs: InverseInputs, names: tuple[str, ...]) -> np.ndarra
     return found
 
 
-def _solve_light(inputs, settings, viewer, scenery: Scenery, fitted, chart, progress, note, start=None) -> Solution:
+def _solve_light(
+    inputs, settings, viewer, scenery: Scenery, fitted, chart, progress, note, start: Solution | None = None
+) -> tuple[Solution, Capture]:
     chosen, kept = frames_of(inputs, settings, settings.light_frames, fitted)
     skin = segment_vertices(inputs, FACE_SKIN)
     capture = build_capture(
@@ -193,7 +198,7 @@ def _solve_light(inputs, settings, viewer, scenery: Scenery, fitted, chart, prog
         progress=lambda items: progress(items, "tracing visibility"),
     )
     capture = replace(capture, chart=chart)
-    return fit_appearance(capture, settings.appearance, lambda record: note(_describe(record)), start)
+    return fit_appearance(capture, settings.appearance, lambda record: note(_describe(record)), start), capture
 
 
 def describe_light(state) -> str:

@@ -89,7 +89,9 @@ def local_roughness(solver: AppearanceSolver) -> tuple[GlossEquations | None, di
     solver.bake()
     solver.bake_lobes()
     irradiance, reflection = solver.forward(state.light)
-    weight = solver.weights(solver.model(irradiance, reflection))
+    model = solver.model(irradiance, reflection)
+    weight = solver.weights(model)
+    solver.measure_misfit(model, weight)
     equations = _gather(solver, irradiance, weight * solver.fitted)
     specular = torch.from_numpy(equations.specular_at(equations.positions).astype(np.float32))[None, :, None]
     local = np.maximum(equations.roughness(equations.positions), solver.table.narrowest)
