@@ -24,3 +24,14 @@ def forget_leaks_of_openimageio():
     if "OpenImageIO" in sys.modules:
         sys.stderr.flush()
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+
+
+@pytest.fixture(scope="module")
+def one_thread():
+    """Matrices this small are slower on several threads, much so beside other work."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

@@ -26,6 +26,8 @@ from shared.solve.reference_shape import LargeSteps
 from shared.solve.views import Camera, HeadViews
 from stages.inverse_render import STAGE, read_settings
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 FRAMES, SIZE, MAP = 9, (64, 64), 32
 LENS = np.array([[230.0, 0, 32], [0, 230.0, 32], [0, 0, 1]])
 

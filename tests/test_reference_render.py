@@ -15,6 +15,8 @@ from shared.solve.reference_raster import Raster, SurfacePoints, blend, torch_ve
 from shared.solve.reference_shade import Sampling, Shader, Texture
 from shared.transfer import Points, bounce_nodes, irradiance, trace_transfer
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 LENS, SIZE = np.array([[120.0, 0, 24], [0, 120.0, 20], [0, 0, 1]]), (48, 40)
 POSE = rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(np.array([0.1, 0.3, 0.05])), np.array([3.0, -5.0, 600.0]))
 DOUBLE = torch.float64

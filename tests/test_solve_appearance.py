@@ -19,15 +19,6 @@ from shared.transfer import nearest_points
 
 
 @pytest.fixture(scope="module")
-def one_thread():
-    """Matrices this small are slower on several threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="module")
 def truth(one_thread):
     return make_truth()
 
