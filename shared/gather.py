@@ -153,6 +153,14 @@ def sample_colours(picture: Picture, pixels: np.ndarray, footprint: np.ndarray |
     return colours
 
 
+def satisfied(limits, error):
+    """Where a clipped or crushed sample, which only knows a bound, says nothing against the model.
+
+    limits as in Samples; error: model minus sample. Arrays or tensors of one shape -> bool of that shape.
+    """
+    return ((limits > 0) & (error >= 0)) | ((limits < 0) & (error <= 0))
+
+
 def sample_limits(picture: Picture, pixels: np.ndarray) -> np.ndarray:
     """[N, 2] -> int8 [N, 3]: +1 or -1 where a pixel that the sample reads is clipped or crushed."""
     found = remap(picture.limits.astype(np.float32), pixels, cv2.INTER_LINEAR)

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from shared.brdf import hemispherical_albedo
-from shared.gather import Samples
+from shared.gather import Samples, satisfied
 from shared.lobes import LobeTable, specular_tables
 from shared.solve.chart_scale import ChartStatement
 from shared.solve.light import FrameLight, LightPriors
@@ -243,28 +243,28 @@ class AppearanceSolver:
         weight = self.trust * self.precision
         if model is None:
             return weight * (self.limits == 0)
-        error, satisfied = self._errors(model)
-        return weight * (~satisfied) / (1.0 + error / (CAUCHY * self._spread(error, satisfied)))
+        error, silent = self._errors(model)
+        return weight * (~silent) / (1.0 + error / (CAUCHY * self._spread(error, silent)))
 
     def _errors(self, model: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Squared errors over the assumed noise's variance, and where a censored sample is satisfied; [3, P, F]."""
-        satisfied = ((self.limits > 0) & (model >= self.colours)) | ((self.limits < 0) & (model <= self.colours))
-        return (model - self.colours).square() * self.precision, satisfied
+        error = model - self.colours
+        return error.square() * self.precision, satisfied(self.limits, error)
 
-    def _spread(self, error: torch.Tensor, satisfied: torch.Tensor) -> float:
+    def _spread(self, error: torch.Tensor, silent: torch.Tensor) -> float:
         """Variance of the errors over the assumed noise's, by their median."""
         used = (self.trust > 0).expand_as(error)
-        return max(float(error[used & ~satisfied].median()), 0.05) / 0.4549
+        return max(float(error[used & ~silent].median()), 0.05) / 0.4549
 
     def loss(self, model: torch.Tensor, spread: float | None = None) -> tuple[float, float]:
         """Mean Cauchy loss of the fitted samples, of errors of this spread (None: their own), and that spread.
 
         What the steps lower: unlike a mean square it does not rise when many samples fit better and a few worse.
         """
-        error, satisfied = self._errors(model)
-        spread = self._spread(error, satisfied) if spread is None else spread
+        error, silent = self._errors(model)
+        spread = self._spread(error, silent) if spread is None else spread
         weight = self.trust * self.fitted
-        loss = torch.log1p(error * (~satisfied) / (CAUCHY * spread))
+        loss = torch.log1p(error * (~silent) / (CAUCHY * spread))
         return float((weight * loss).sum() / (3.0 * weight.sum())), spread
 
     def eliminate(self, irradiance, reflection, weight, specular: float | None = None) -> torch.Tensor:

@@ -27,7 +27,7 @@ from shared.solve.chart_scale import describe_scale, doubt_scale, state_chart
 from shared.solve.fit_appearance import Solution, fit_appearance, with_local_roughness
 from shared.solve.frame_choice import covering_frames
 from shared.solve.reference_settings import ReferenceSettings
-from shared.solve.reshape import reshape
+from shared.solve.reshape import faces_of, reshape
 from shared.solve.shape import Reflectance, ShapeSettings
 from shared.solve.texture import PRIOR_SPREAD, TexelMaterial
 from shared.solve.texture_pass import Clip, TexturePass
@@ -134,10 +134,9 @@ def solve_clip(
     gloss = solution.gloss
     roughness = solution.state.roughness if gloss is None else gloss.roughness(inputs.mesh.vertices)
     maps = make_maps(surface, material, roughness)
-    skin = np.median(solution.state.albedo, axis=0)
-    warnings = [*[warning] * bool(warning), *doubt_scale(chart, skin)]
+    warnings = [*[warning] * bool(warning), *doubt_scale(chart, typical)]
     record = {"texture": texture_record, "shape": shape_record, "warnings": warnings}
-    record |= {"albedo_scale": describe_scale(chart, skin)}
+    record |= {"albedo_scale": describe_scale(chart, typical)}
     return InverseResult(solution, material, maps, shading, viewer, fitted, record)
 
 
@@ -173,9 +172,8 @@ def segment_vertices(inputs: InverseInputs, names: tuple[str, ...]) -> np.ndarra
     """[V] bool: vertices of faces in the named segments; all of them where the mesh has no segments."""
     if inputs.face_segment is None:
         return np.ones(len(inputs.mesh.vertices), bool)
-    wanted = [inputs.segment_names.index(name) for name in names if name in inputs.segment_names]
     found = np.zeros(len(inputs.mesh.vertices), bool)
-    found[inputs.mesh.faces[np.isin(inputs.face_segment, wanted)]] = True
+    found[inputs.mesh.faces[faces_of(inputs, names)]] = True
     return found
 
 

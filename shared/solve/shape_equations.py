@@ -19,6 +19,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
+from shared.gather import satisfied
 from shared.solve.shape_samples import SurfaceSamples
 from shared.solve.shape_terms import ShadingTerms
 from shared.transfer import spread_vertices
@@ -127,17 +128,13 @@ def _fit_albedo(samples, irradiance, gloss, fitted, noise) -> tuple[np.ndarray, 
         albedo = (used * (samples.colours - gloss)).sum(1) / np.maximum((used * irradiance).sum(1), 1e-9)
         albedo = np.clip(albedo, MINIMUM_ALBEDO, MAXIMUM_ALBEDO)
         error = albedo[:, None] * irradiance + gloss - samples.colours
-        weight = base * ~_satisfied(error, samples.limits) / (1.0 + (error / (CAUCHY_SCALE * sigma)) ** 2)
+        weight = base * ~satisfied(samples.limits, error) / (1.0 + (error / (CAUCHY_SCALE * sigma)) ** 2)
     return albedo, weight
-
-
-def _satisfied(error: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    return ((limits > 0) & (error >= 0)) | ((limits < 0) & (error <= 0))
 
 
 def _rms(error: np.ndarray, samples: SurfaceSamples, fitted: np.ndarray) -> tuple[float, float]:
     """Trust-weighted rms residual of fitted and of held-out frames."""
-    squared = (np.minimum(error**2, LARGEST_SQUARED_ERROR) * ~_satisfied(error, samples.limits)).sum(2)
+    squared = (np.minimum(error**2, LARGEST_SQUARED_ERROR) * ~satisfied(samples.limits, error)).sum(2)
     result = []
     for chosen in (fitted, ~fitted):
         weight = samples.weight * chosen

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
 
+from shared.gather import satisfied
 from shared.texels import TexelSamples, TexelSurface
 
 CORRELATED_FRAMES = 6.0
@@ -116,9 +117,9 @@ def robust_weight(
     information [n]: precision of the model's log albedo; what it leaves open is no reason to distrust a sample.
     """
     error = model - samples.colours
-    satisfied = ((samples.limits > 0) & (error >= 0)) | ((samples.limits < 0) & (error <= 0))
     variance = 1.0 / noise.precision(samples.colours) + model**2 / (information[:, None] + PRIOR_SPREAD**-2)
-    return np.where(satisfied, 0.0, 1.0 / (1.0 + error**2 / (scale**2 * variance))).astype(np.float32)
+    weight = 1.0 / (1.0 + error**2 / (scale**2 * variance))
+    return np.where(satisfied(samples.limits, error), 0.0, weight).astype(np.float32)
 
 
 def pooled_specular(

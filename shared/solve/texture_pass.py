@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.gather import Picture, SurfaceViewer
+from shared.gather import Picture, SurfaceViewer, satisfied
 from shared.shading import VertexShading
 from shared.solve.capture import spread_frames
 from shared.solve.texture import (
@@ -148,7 +148,7 @@ class TexturePass:
             total += 3.0 * float(samples.weight.sum())
             for k, material in enumerate(candidates):
                 error = _model(material, samples, irradiance, reflection) - samples.colours
-                error[((samples.limits > 0) & (error >= 0)) | ((samples.limits < 0) & (error <= 0))] = 0.0
+                error[satisfied(samples.limits, error)] = 0.0
                 squared[k] += float((samples.weight[:, None] * np.minimum(error**2, 0.01)).sum())
         return [float(value) for value in np.sqrt(squared / max(total, 1e-9))]
 
