@@ -16,7 +16,6 @@ References: Karis, Real shading in Unreal Engine 4, SIGGRAPH courses 2013 (split
 from __future__ import annotations
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
 
 from shared.brdf import F0, MINIMUM_COSINE, microfacet_integrals
@@ -103,13 +102,13 @@ class SplitSum:
         return (open_ & above).sum(1) / np.maximum(above.sum(1), 1)
 
     def kernel(
-        self, normals: torch.Tensor, towards: torch.Tensor, roughness: float, visible: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """As LobeTable.kernel: weights [P, J] of all directions and of the open ones."""
-        n, o = normals.numpy().astype(np.float64), towards.numpy().astype(np.float64)
+        self, normals: np.ndarray, towards: np.ndarray, roughness: float, visible: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Weights [P, J] float32 of all directions and of the open ones; normals, towards [P, 3], visible [P, J]."""
+        n, o = normals.astype(np.float64), towards.astype(np.float64)
         cosine = (n * o).sum(1)
         reflected = 2.0 * cosine[:, None] * n - o
         every = self.prefilter(reflected, roughness)
         every *= (self._energy(np.maximum(cosine, MINIMUM_COSINE), roughness) * (cosine > 0))[:, None]
-        share = self.visible_share(n, o, roughness, visible.numpy())
-        return torch.from_numpy(every).float(), torch.from_numpy(every * share[:, None]).float()
+        share = self.visible_share(n, o, roughness, visible)
+        return every.astype(np.float32), (every * share[:, None]).astype(np.float32)

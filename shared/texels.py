@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sparse
 import torch
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu
 
 from shared.gather import Picture, View, sample_colours, sample_inside, sample_limits, texel_size
 from shared.mesh import Mesh, rasterize_uv, vertex_adjacency
@@ -82,20 +82,22 @@ class TexelSurface:
         return TexelSamples(rows, colours, weight, sample_limits(picture, pixels)), found[:, 4:]
 
     def to_vertices(self, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Weighted means of texel values [T, C] around each vertex; weight [T, C] -> means and total weights [V, C]."""
-        count, corners = len(self.mesh.vertices), self.mesh.faces[self.face].ravel()
-        total, mean = np.zeros((count, values.shape[1])), np.zeros((count, values.shape[1]))
-        for c, (value, trust) in enumerate(zip(values.T, weight.T, strict=True)):
-            share = self.bary * trust[:, None]
-            total[:, c] = np.bincount(corners, share.ravel(), count)
-            mean[:, c] = np.bincount(corners, (share * value[:, None]).ravel(), count)
-        return mean / np.maximum(total, 1e-12), total
+        """Weighted means of texel values [T, C, ...] around each vertex; weight [T, C] -> means [V, C, ...] and total
+        weights [V, C]."""
+        shape = (len(self.mesh.vertices), len(self))
+        entries = self.mesh.faces[self.face].ravel(), np.repeat(np.arange(len(self)), 3)
+        gather = sparse.csr_matrix((self.bary.ravel(), entries), shape)
+        total = gather @ weight
+        spread = weight.reshape(weight.shape + (1,) * (values.ndim - 2))
+        sums = (gather @ (spread * values).reshape(len(self), -1)).reshape(shape[:1] + values.shape[1:])
+        return sums / np.maximum(total, 1e-12).reshape(total.shape + (1,) * (values.ndim - 2)), total
 
 
 def smooth_field(
     mesh: Mesh, values: np.ndarray, precision: np.ndarray, mean: np.ndarray, step: float, spread: float
 ) -> np.ndarray:
-    """Most likely vertex values [V, C] of a field that is smooth over the mesh, given values of some precision [V, C].
+    """Most likely vertex values [V, C, ...] of fields that are smooth over the mesh, given values [V, C, ...] of some
+    precision [V, C].
 
     Gaussian Markov field: neighbours differ by step, and a vertex from the mean [C] by spread, both standard
     deviations. Where nothing is known it continues its surroundings and sinks to the mean. Works across texture seams,
@@ -104,7 +106,10 @@ def smooth_field(
     count = len(mesh.vertices)
     adjacency = vertex_adjacency(mesh.faces, count)
     graph = sparse.diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency
-    prior = (graph / step**2 + sparse.identity(count) / spread**2).tocsc()
-    right = precision * values + mean / spread**2
-    columns = zip(right.T, precision.T, strict=True)
-    return np.stack([spsolve(prior + sparse.diags(known), target) for target, known in columns], axis=1)
+    prior = graph / step**2 + sparse.identity(count) / spread**2
+    result = np.empty(values.shape)
+    for c, known in enumerate(precision.T):
+        right = (values[:, c].reshape(count, -1).T * known + mean[c] / spread**2).T
+        solved = splu((prior + sparse.diags(known)).tocsc()).solve(right)
+        result[:, c] = solved.reshape(result[:, c].shape)
+    return result

@@ -25,6 +25,7 @@ WHEELS = {
     "pymeshlab": "pymeshlab.MeshSet().meshing_surface_subdivision_loop",
     "OpenEXR": "OpenEXR.File",
     "pycolmap": "pycolmap.Reconstruction",
+    "numba": "numba.njit(lambda x: x + 1)(1)",
     "pxr": "__import__('pxr.UsdGeom')",
 }
 """Modules and an expression that fails where a wheel is only half there."""

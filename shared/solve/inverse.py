@@ -12,6 +12,7 @@ from shared.chart import ChartSight
 from shared.gather import Picture, SurfaceViewer
 from shared.mesh import Mesh
 from shared.raycast import RayScene
+from shared.read_ahead import read_ahead
 from shared.shading import Material, VertexShading
 from shared.solve.appearance import Capture, Settings
 from shared.solve.capture import (
@@ -185,7 +186,7 @@ def _solve_light(
     capture = build_capture(
         viewer,
         scenery,
-        (inputs.picture(f) for f in progress(chosen, "gathering samples")),
+        read_ahead(inputs.picture, progress(chosen, "gathering samples")),
         inputs.camera_from_head[chosen],
         inputs.intrinsics,
         settings.appearance.light_moves(inputs.moves),

@@ -16,6 +16,7 @@ import scipy.sparse as sparse
 from shared.gather import SurfaceViewer
 from shared.mesh import Mesh, subdivide, vertex_normals
 from shared.raycast import RayScene
+from shared.read_ahead import read_ahead
 from shared.shading import DEEP, Material, VertexShading
 from shared.solve.appearance import Settings
 from shared.solve.capture import Scenery, Sizes, face_front, set_scenery
@@ -147,7 +148,7 @@ class ShapeSolver:
         """Samples, shading and equations of the traced vertices; None where hardly any is seen."""
         clip, settings, index = self.clip, self.settings, traced.index
         viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
-        pictures = (clip.picture(f) for f in self.progress(range(len(clip.camera_from_head)), "shape, sampling"))
+        pictures = read_ahead(clip.picture, self.progress(range(len(clip.camera_from_head)), "shape, sampling"))
         blur = BLUR_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
         samples = gather_surface(viewer, index, pictures, clip.camera_from_head, clip.intrinsics, blur)
         points = mesh_points(mesh, index)

@@ -11,7 +11,6 @@ Reference: the irradiance vector, Arvo, The irradiance Jacobian for partially oc
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +18,7 @@ import scipy.sparse as sparse
 import torch
 from scipy.spatial import cKDTree
 
-from shared.lobes import LobeTable, specular_reflection
+from shared.lobes import specular_reflection
 from shared.mesh import normalised
 from shared.shading import VertexShading
 from shared.solve.shape_samples import tangent_frames
@@ -66,7 +65,7 @@ class Reflections:
         self.normals = points.normals[self.anchors]
         self.tangents = tangent_frames(self.normals)
         table = shading.table.take(self.anchors)
-        turned = [_turned(table, self.normals + NORMAL_STEP * self.tangents[:, k]) for k in range(2)]
+        turned = [table.turned(normalised(self.normals + NORMAL_STEP * self.tangents[:, k])) for k in range(2)]
         self.tables = [table, *turned]
         near = cKDTree(position_and_normal(points.take(self.anchors)))
         distance, which = near.query(position_and_normal(points.take(rows)), k=min(4, len(self.anchors)))
@@ -116,9 +115,3 @@ def shading_terms(shading: VertexShading, rows: np.ndarray, with_specular: bool)
             reflection_turn[:, f] = np.einsum("pcx,pkx->pck", slope, tangents)
     return ShadingTerms(tangents, shading.irradiance_of_points(rows), reflection, turn, reflection_turn)
 
-
-def _turned(table: LobeTable, normals: np.ndarray) -> LobeTable:
-    """The same points with other normals; what they see stays."""
-    other = copy(table)
-    other.normals = torch.from_numpy(normalised(normals).astype(np.float32))
-    return other

@@ -14,9 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.ndimage import gaussian_filter
 
+from shared.compiled import compiled
 from shared.gather import satisfied
 from shared.texels import TexelSamples, TexelSurface
 
@@ -75,16 +75,9 @@ class NormalEquations:
 
     def add(self, samples: TexelSamples, irradiance: np.ndarray, reflection: np.ndarray, robust: np.ndarray) -> None:
         """irradiance, reflection, robust [n, 3] at samples.rows; robust: extra weight per channel."""
-        weight = samples.weight[:, None] * self.noise.precision(samples.colours) * robust
-        we, ws = weight * irradiance, weight * reflection
-        share = [we * irradiance, we * reflection, we * samples.colours, ws * reflection, ws * samples.colours]
-        share.append(share[0] * (samples.limits == 0))
-        rows, share = torch.from_numpy(samples.rows), torch.from_numpy(np.concatenate(share, axis=1, dtype=np.float32))
-        torch.from_numpy(self.sums).index_add_(0, rows, share)
-        clipped = np.nonzero((samples.limits > 0).any(1))[0]
-        weight = samples.weight[clipped, None] * self.noise.precision(samples.colours[clipped])
-        lost = weight * np.square(irradiance[clipped]) * (samples.limits[clipped] > 0)
-        self.clipped_ee[samples.rows[clipped]] += lost  # a frame shows a texel once
+        limits, noise = samples.limits, (np.float32(self.noise.absolute), np.float32(self.noise.relative))
+        seen = samples.rows, samples.weight, samples.colours, limits, irradiance, reflection, robust
+        _add_samples(*seen, *noise, self.sums, self.clipped_ee)
 
     def solve_albedo(self, specular: np.ndarray, fallback: np.ndarray, pull: float | np.ndarray) -> np.ndarray:
         """Albedo [T, 3] for given specular [T]; fallback [T, 3] acts with precision pull, a number or [T, 3]."""
@@ -107,6 +100,28 @@ class NormalEquations:
         albedo = np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)
         spared = self.measured_ee / np.maximum(self.measured_ee + self.clipped_ee, 1e-9)
         return 1.0 / (systematic + CORRELATED_FRAMES / np.maximum(spared**2 * self.measured_ee * albedo**2, 1e-9))
+
+
+@compiled
+def _add_samples(
+    rows, weight, colours, limits, irradiance, reflection, robust, absolute, relative, sums, clipped_ee
+):
+    for i in range(len(rows)):
+        row = rows[i]
+        for c in range(3):
+            colour, e, s = colours[i, c], irradiance[i, c], reflection[i, c]
+            sigma = absolute + relative * colour
+            trust = weight[i] / (sigma * sigma)
+            weighted = trust * robust[i, c]
+            sums[row, c] += weighted * e * e
+            sums[row, 3 + c] += weighted * e * s
+            sums[row, 6 + c] += weighted * e * colour
+            sums[row, 9 + c] += weighted * s * s
+            sums[row, 12 + c] += weighted * s * colour
+            if limits[i, c] == 0:
+                sums[row, 15 + c] += weighted * e * e
+            elif limits[i, c] > 0:
+                clipped_ee[row, c] += trust * e * e
 
 
 def robust_weight(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shared.gather import Picture, SurfaceViewer, satisfied
+from shared.read_ahead import read_ahead
 from shared.shading import VertexShading
 from shared.solve.capture import spread_frames
 from shared.solve.texture import (
@@ -71,12 +72,10 @@ class TexturePass:
         mean = np.full(count, self.specular, np.float32)
         fitted = np.nonzero(self.clip.fitted)[0]
         some = fitted[spread_frames(len(fitted), FIRST_PASS_FRAMES)]
-        first = self._close(self._accumulate(None, some, "texture, first pass"), mean)
+        (first,) = self._close(self._accumulate(None, some, "texture, first pass"), [mean])
         equations = self._accumulate(first, fitted, "texture, second pass")
-        candidates = [
-            self._close(equations, pooled_specular(self.surface, equations, width, self.specular, self.sigma))
-            for width in widths
-        ]
+        pooled = [pooled_specular(self.surface, equations, width, self.specular, self.sigma) for width in widths]
+        candidates = self._close(equations, pooled)
         errors = self.held_out_errors(candidates)
         best = int(np.argmin(errors))
         names = ["one value" if not np.isfinite(width) else f"{width:g} texels" for width in widths]
@@ -85,8 +84,7 @@ class TexturePass:
 
     def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> NormalEquations:
         equations = NormalEquations(len(self.surface), self.noise)
-        for f in self.progress(frames, label):
-            samples, irradiance, reflection = self.frame(f)
+        for samples, irradiance, reflection in read_ahead(self.frame, self.progress(frames, label)):
             if material is None:
                 robust = (samples.limits == 0).astype(np.float32)
             else:
@@ -104,47 +102,55 @@ class TexturePass:
         samples, both = self.surface.samples(view, picture, clip.intrinsics, both)
         return samples, both[:, :3], both[:, 3:]
 
-    def _close(self, equations: NormalEquations, specular: np.ndarray) -> TexelMaterial:
-        """Albedo for given intensities; channels left open by the samples follow the others and the neighbourhood."""
+    def _close(self, equations: NormalEquations, intensities: list[np.ndarray]) -> list[TexelMaterial]:
+        """Albedo for each of some given intensities [T]; channels left open by the samples follow the others and the
+        neighbourhood."""
         information = equations.information(self.typical_albedo, self.systematic)
-        rough = equations.solve_albedo(specular, np.zeros_like(equations.ee), 1e-6)
+        nothing = np.zeros_like(equations.ee)
+        rough = np.stack([equations.solve_albedo(specular, nothing, 1e-6) for specular in intensities], axis=2)
+        around = self._surroundings(rough, information).astype(np.float32)
         certain = information / (1.0 + information)
-        smooth = np.exp(self.surface.interpolate(self._surroundings(rough, information).astype(np.float32)))
-        # A texel's brightness by its certain channels, its colour otherwise the neighbourhood's.
-        brighter = (certain * np.log(np.maximum(rough, 1e-3) / smooth)).sum(1) / (certain.sum(1) + 0.3)
-        brighter *= (PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + self.systematic)).mean(1)
+        trusted = (PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + self.systematic)).mean(1)
         pull = _ALBEDO_PULL + equations.ee * (self.systematic / PRIOR_SPREAD**2)
-        albedo = equations.solve_albedo(specular, smooth * np.exp(brighter)[:, None], pull)
-        return TexelMaterial(albedo, specular, information.min(1))
+        found = []
+        for k, specular in enumerate(intensities):
+            smooth = np.exp(self.surface.interpolate(around[..., k]))
+            # A texel's brightness by its certain channels, its colour otherwise the neighbourhood's.
+            brighter = (certain * np.log(np.maximum(rough[..., k], 1e-3) / smooth)).sum(1) / (certain.sum(1) + 0.3)
+            albedo = equations.solve_albedo(specular, smooth * np.exp(brighter * trusted)[:, None], pull)
+            found.append(TexelMaterial(albedo, specular, information.min(1)))
+        return found
 
     def _surroundings(self, rough: np.ndarray, information: np.ndarray) -> np.ndarray:
-        """[V, 3] log albedo as a smooth field: texels that the clip tells little of follow those that it knows.
+        """[V, 3, K] log albedo as smooth fields, of K results rough [T, 3, K]: texels that the clip tells little of
+        follow those that it knows.
 
         Brightness and colour are smooth each for itself, both relative to the person's typical skin: a channel that is
         clipped everywhere takes its brightness from the others that are not, its tint from where all are known.
         """
-        typical = np.log(np.maximum(self.typical_albedo, 1e-3))
+        typical = np.log(np.maximum(self.typical_albedo, 1e-3))[:, None]
         relative = np.log(np.maximum(rough, 1e-3)) - typical
         precision = np.minimum(information, NEIGHBOUR_STEP**-2)
         total = np.maximum(precision.sum(1, keepdims=True), 1e-12)
-        brightness = (precision * relative).sum(1, keepdims=True) / total
+        brightness = np.einsum("tc,tck->tk", precision / total, relative)[:, None]
         tint_precision = precision * (total - precision) / total
         return typical + self._field(brightness, total) + self._field(relative - brightness, tint_precision)
 
     def _field(self, values: np.ndarray, precision: np.ndarray) -> np.ndarray:
-        """Texel values [T, C] of some precision [T, C] -> the smooth field [V, C] through them; 0 far from any."""
+        """Texel values [T, C, K] of some precision [T, C] -> the smooth fields [V, C, K] through them; 0 far from any.
+        """
         means, total = self.surface.to_vertices(values, precision)
         share, _ = self.surface.to_vertices(precision, np.ones_like(precision))
         # What leaves a texel as open as the prior does is mostly a model's error that its neighbours share.
         known = np.where(total > 0.0, share**2 / (share + PRIOR_SPREAD**-2), 0.0)
-        centre = np.zeros(values.shape[1])
+        centre = np.zeros(precision.shape[1])
         return smooth_field(self.surface.mesh, means, known, centre, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD)
 
     def held_out_errors(self, candidates: list[TexelMaterial]) -> list[float]:
         """Root mean square residual of each candidate on the held-out frames (linear, censored, trust-weighted)."""
         squared, total = np.zeros(len(candidates)), 0.0
-        for f in self.progress(np.nonzero(~self.clip.fitted)[0], "texture, held-out frames"):
-            samples, irradiance, reflection = self.frame(f)
+        frames = self.progress(np.nonzero(~self.clip.fitted)[0], "texture, held-out frames")
+        for samples, irradiance, reflection in read_ahead(self.frame, frames):
             total += 3.0 * float(samples.weight.sum())
             for k, material in enumerate(candidates):
                 error = _model(material, samples, irradiance, reflection) - samples.colours

@@ -245,7 +245,7 @@ def size_changes(folder):
     (folder / "clip.mpg").write_bytes(b"")
     parts = [(head() * 3)[:33], [cv2.resize(frame, (96, 96)) for frame in head()[9:]]]
     for number, frames in enumerate(parts):
-        write_video(folder / f"{number}.mpg", frames, codec="mpeg1video", matrix=None)
+        write_video(folder / f"{number}.mpg", frames, codec="mpeg1video", matrix=None, options={"b": "4M"})
     data = b"".join((folder / f"{number}.mpg").read_bytes() for number in (0, 1))
     (folder / "clip.mpg").write_bytes(data)
     for number in (0, 1):
