@@ -66,11 +66,14 @@ def uniform_laplacian(faces: np.ndarray, count: int) -> sparse.csr_matrix:
     return (sparse.identity(count) - sparse.diags(1.0 / degree) @ adjacency).tocsr()
 
 
-def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """[F, 3] -> edges [E, 2], edge of each corner pair (01, 12, 20) [F, 3], faces that share the edge [E]."""
-    pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
-    edges, inverse, shared = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
-    return edges, inverse.reshape(-1, 3), shared
+def mesh_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """[F, 3] -> edges [E, 2] with the lower vertex first, in order; edge of each corner pair (01, 12, 20) [F, 3]; how
+    many faces share each edge [E]."""
+    pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2).astype(np.int64)
+    count = int(pairs.max(initial=0)) + 1
+    # One number for a pair sorts many times faster than rows do.
+    keys, inverse, shared = np.unique(pairs @ [count, 1], return_inverse=True, return_counts=True)
+    return np.stack(np.divmod(keys, count), axis=1), inverse.reshape(-1, 3), shared
 
 
 def _split(faces: np.ndarray, face_edges: np.ndarray, count: int) -> np.ndarray:
@@ -83,7 +86,7 @@ def _split(faces: np.ndarray, face_edges: np.ndarray, count: int) -> np.ndarray:
 
 def midpoint_subdivision(faces: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndarray]:
     """Splits each face in four without moving anything: matrix [count + E, count] and faces [4 F, 3]."""
-    edges, face_edges, _ = _edges(faces)
+    edges, face_edges, _ = mesh_edges(faces)
     rows = np.repeat(np.arange(len(edges)), 2)
     middle = sparse.coo_matrix((np.full(len(rows), 0.5), (rows, edges.ravel())), shape=(len(edges), count))
     return sparse.vstack([sparse.identity(count), middle]).tocsr(), _split(faces, face_edges, count)
@@ -95,7 +98,7 @@ def loop_subdivision(faces: np.ndarray, count: int) -> tuple[sparse.csr_matrix, 
     faces [F, 3], count vertices -> matrix [count + E, count], faces [4 F, 3]. Inner vertices take Warren's weights
     (3/16 for three neighbours, else 3 / (8 n)); boundary vertices 1/8, 3/4, 1/8; inner edges 3/8, 3/8, 1/8, 1/8.
     """
-    edges, face_edges, shared = _edges(faces)
+    edges, face_edges, shared = mesh_edges(faces)
     boundary = shared == 1
     adjacency = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)).tocsr()
     rim = sparse.coo_matrix((boundary.astype(float), edges.T), shape=(count, count)).tocsr()

@@ -42,3 +42,13 @@ def test_folded_faces_are_unfolded():
     assert turned_faces(plane.vertices, wanted, plane.faces).any()
     placed = move_without_crossing(plane.vertices, wanted, plane.faces)
     assert not turned_faces(plane.vertices, placed, plane.faces).any()
+
+
+def test_a_move_stops_before_it_cuts_and_goes_on_elsewhere(ball):
+    wanted = 1.02 * ball.vertices
+    aside = int(np.argmin(np.abs(ball.vertices @ ball.vertices[0])))
+    wanted[0] = -1.2 * ball.vertices[0]
+    placed = move_without_crossing(ball.vertices, wanted, ball.faces)
+    assert len(crossing_edges(placed, ball.faces)) == 0
+    assert not turned_faces(ball.vertices, placed, ball.faces).any()
+    np.testing.assert_allclose(placed[aside], wanted[aside])
