@@ -221,7 +221,8 @@ def fit_surface(
         wanted = interpolation @ (vertices - fit.vertices) + under.offset[:, None] * under.normal
         weighted = sparse.diags(under.weight) @ interpolation
         matrix = interpolation.T @ weighted + stiffness * plate + contact
-        vertices = fit.vertices + splu(matrix.tocsc()).solve(weighted.T @ wanted)
+        factor = splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        vertices = fit.vertices + factor.solve(weighted.T @ wanted)
     return HeadFit(fit.scale, fit.rotation, fit.translation, fit.identity, fit.expression, vertices)
 
 
