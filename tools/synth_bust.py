@@ -27,9 +27,9 @@ def with_bust(head: Mesh) -> Mesh:
     closed = np.concatenate([index, index[:, :1]], 1)
     return Mesh(
         np.concatenate([head.vertices, rings[1:].reshape(-1, 3)]),
-        np.concatenate([head.faces, _quads(closed)]).astype(np.int32),
+        np.concatenate([head.faces, quads(closed)]).astype(np.int32),
         uvs,
-        np.concatenate([head.face_uvs, _quads(uv_index)]).astype(np.int32),
+        np.concatenate([head.face_uvs, quads(uv_index)]).astype(np.int32),
     )
 
 
@@ -74,7 +74,7 @@ def _bust_rings(rim: np.ndarray, tangents: np.ndarray) -> np.ndarray:
     return (1 - t) ** 3 * rim + 3 * t * (1 - t) ** 2 * neck + 3 * t**2 * (1 - t) * shoulder + t**3 * bottom
 
 
-def _quads(index: np.ndarray) -> np.ndarray:
-    """[R, C] grid of indices -> triangles [2 (R - 1) (C - 1), 3] that continue the surface above."""
+def quads(index: np.ndarray) -> np.ndarray:
+    """[R, C] grid of indices -> triangles [2 (R - 1) (C - 1), 3], facing whom columns run to the left for."""
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     return np.stack([np.stack([b, a, c], -1), np.stack([b, c, d], -1)], 2).reshape(-1, 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,8 +38,11 @@ class Head:
         return interpolate(self.mesh.vertices, self.mesh.faces, self.landmark_face, self.landmark_bary)
 
 
-def random_head(model: HeadModel, seed: int, eyes_closed: bool) -> Head:
-    """A head of the given model (any level): random identity, a slight expression, bumps as displacements."""
+def random_head(model: HeadModel, seed: int, eyes_closed: bool, extra: Mapping[str, float] | None = None) -> Head:
+    """A head of the given model (any level): random identity, a slight expression, bumps as displacements.
+
+    extra: activations by name that come on top of the expression.
+    """
     rng = np.random.default_rng([seed, 1])
     identity = rng.normal(0, IDENTITY_DEVIATION, len(model.identity_basis))
     expression = np.zeros(len(model.expression_basis))
@@ -46,8 +50,8 @@ def random_head(model: HeadModel, seed: int, eyes_closed: bool) -> Head:
     amounts = {"mouth_smile_left": smile, "mouth_smile_right": smile * rng.uniform(0.7, 1.3),
                "brow_inner_up": rng.uniform(0, 0.15), "eye_blink_left": 1.0 if eyes_closed else 0.05,
                "eye_blink_right": 1.0 if eyes_closed else 0.05}
-    for name, amount in amounts.items():
-        expression[model.expression_names.index(name)] = amount
+    for name, amount in [*amounts.items(), *(extra or {}).items()]:
+        expression[model.expression_names.index(name)] += amount
     mesh = model.mesh(identity, expression)
     mesh = with_bust(mesh.replace(vertices=mesh.vertices + _bumps(model, mesh, rng)))
     segment = np.full(len(mesh.faces), model.segment_names.index("neck"), np.uint8)
@@ -83,7 +87,7 @@ def head_turn(
     time = (np.arange(frames) + 0.25) / frames
     sway = np.where(time < 0.5, -np.sin(4 * np.pi * time), 0.0)
     nod = np.where(time >= 0.5, -np.sin(4 * np.pi * time), 0.0)
-    drift = np.stack([_smooth_random(time, rng) for _ in range(6)], 1)
+    drift = np.stack([smooth_random(time, rng) for _ in range(6)], 1)
     angles = np.radians(np.stack([pitch_deg * nod, yaw_deg * sway, 0 * time], 1) + DRIFT_DEG * drift[:, :3])
     turn = (rotation_from_vector(angles * [0, 1, 0]) @ rotation_from_vector(angles * [1, 0, 0])
             @ rotation_from_vector(angles * [0, 0, 1]))
@@ -92,7 +96,7 @@ def head_turn(
     return rigid(camera_from_world @ turn, world_place @ camera_from_world.T + [0.0, 0.0, distance_mm])
 
 
-def _smooth_random(time: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def smooth_random(time: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A slowly varying random curve of about unit size."""
     curve = np.zeros_like(time)
     for cycles in (1, 2, 3):

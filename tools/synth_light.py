@@ -162,7 +162,12 @@ def _lamp(directions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return light
 
 
-ENVIRONMENTS = {"room": _room, "studio": _studio, "sky": _sky, "lamp": _lamp}
+def _cap(directions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A lamp above the forehead and nothing else, as on a cap or a helmet."""
+    return _disc(directions, 0.0, 40.0, 7) * [60.0, 58.0, 54.0]
+
+
+ENVIRONMENTS = {"room": _room, "studio": _studio, "sky": _sky, "lamp": _lamp, "cap": _cap}
 
 
 def _gradient(directions: np.ndarray, floor: tuple, horizon: tuple, zenith: tuple) -> np.ndarray:

@@ -53,7 +53,10 @@ class Complexion:
 
 
 class SkinPainter:
-    """Paints textures of size x size for one head."""
+    """Paints textures of size x size for one head.
+
+    place [size, size, 3]: the surface's points, mm; landmarks [468, 3], mm.
+    """
 
     def __init__(self, head: Head, size: int, seed: int):
         self.size = size
@@ -64,21 +67,21 @@ class SkinPainter:
         self._fill = tuple(distance_transform_edt(empty, return_distances=False, return_indices=True))
         face, bary = face[self._fill], bary[self._fill]
         self._segment = head.face_segment[face]
-        self._place = interpolate(mesh.vertices, mesh.faces, face.ravel(), bary.reshape(-1, 3)).reshape(size, size, 3)
-        self._landmarks = head.landmarks()
+        self.place = interpolate(mesh.vertices, mesh.faces, face.ravel(), bary.reshape(-1, 3)).reshape(size, size, 3)
+        self.landmarks = head.landmarks()
 
-    def _inside(self, *names: str) -> np.ndarray:
+    def inside(self, *names: str) -> np.ndarray:
         """[size, size] bool: the named segments."""
         return np.isin(self._segment, [self._head.segment_names.index(name) for name in names])
 
     def region(self, *names: str, softness_mm: float = 2.5) -> np.ndarray:
         """[size, size] in [0, 1]: the named segments with soft borders."""
-        inside = self._inside(*names).astype(np.float32)
+        inside = self.inside(*names).astype(np.float32)
         return cv2.GaussianBlur(inside, (0, 0), max(softness_mm * self._texels_per_mm(), 0.5))
 
     def noise(self, wavelength_mm: float) -> np.ndarray:
         """[size, size] smooth random pattern over the surface, mean 0, standard deviation about 1."""
-        return value_noise(self._place, wavelength_mm, self._rng).astype(np.float32)
+        return value_noise(self.place, wavelength_mm, self._rng).astype(np.float32)
 
     def paint(self, complexion: Complexion) -> Materials:
         """All textures."""
@@ -93,7 +96,7 @@ class SkinPainter:
         specular -= 0.25 * hair + 0.5 * cloth
         roughness += 0.08 * hair + 0.2 * cloth
         albedo, specular, roughness = self._eyes(albedo, specular, roughness, complexion)
-        mask = self._inside(*MASK_SEGMENTS)
+        mask = self.inside(*MASK_SEGMENTS)
         return Materials(np.clip(albedo, 0.01, 0.9).astype(np.float32), np.clip(specular, 0.1, 1.2).astype(np.float32),
                          np.clip(roughness, 0.22, 0.7).astype(np.float32), mask.astype(np.float32))
 
@@ -106,7 +109,7 @@ class SkinPainter:
         specular = 0.72 + 0.06 * self.noise(14) + 0.05 * self.noise(2.5)
         roughness = 0.45 + 0.015 * self.noise(20) + 0.015 * self.noise(3)
         for landmark, radius in BLUSH.items():
-            distance = np.linalg.norm(self._place - self._landmarks[landmark], axis=-1)
+            distance = np.linalg.norm(self.place - self.landmarks[landmark], axis=-1)
             haemoglobin += 0.32 * np.exp(-0.5 * (distance / radius) ** 2)
         for name, (more_melanin, more_haemoglobin, more_specular, more_roughness) in REGIONS.items():
             region = self.region(name, softness_mm=0.8 if name == "lips" else 4.0)
@@ -124,11 +127,11 @@ class SkinPainter:
 
     def _moles(self) -> np.ndarray:
         """A handful of single dark spots on cheeks, chin, forehead and neck."""
-        inside = self._inside("cheek_left", "cheek_right", "chin", "forehead", "neck")
-        places = self._place[inside]
+        inside = self.inside("cheek_left", "cheek_right", "chin", "forehead", "neck")
+        places = self.place[inside]
         moles = np.zeros((self.size, self.size))
         for index in self._rng.integers(len(places), size=7):
-            distance = np.linalg.norm(self._place - places[index], axis=-1)
+            distance = np.linalg.norm(self.place - places[index], axis=-1)
             moles += self._rng.uniform(0.4, 1.1) / (1 + (distance / self._rng.uniform(0.6, 1.3)) ** 6)
         return moles
 
@@ -143,7 +146,7 @@ class SkinPainter:
 
     def _cloth(self) -> np.ndarray:
         """[size, size] share of the surface that the shirt covers: all below a plane that rises to the back."""
-        height = self._place[..., 1] - (COLLAR_Y_MM + COLLAR_SLOPE * self._place[..., 2])
+        height = self.place[..., 1] - (COLLAR_Y_MM + COLLAR_SLOPE * self.place[..., 2])
         return np.clip(0.5 - height / 4, 0, 1)
 
     def _brows(self) -> np.ndarray:
@@ -167,11 +170,11 @@ class SkinPainter:
     def _eyes(self, albedo: np.ndarray, specular: np.ndarray, roughness: np.ndarray,
               complexion: Complexion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """White of the eye, iris and pupil on the eyeballs, looking straight ahead."""
-        eye = self._inside("eyes")
+        eye = self.inside("eyes")
         grain = self.noise(0.8)
         for side in (-1, 1):
-            ball = eye & (np.sign(self._place[..., 0]) == side)
-            places = self._place[ball]
+            ball = eye & (np.sign(self.place[..., 0]) == side)
+            places = self.place[ball]
             centre = 0.5 * (places.min(0) + places.max(0))
             outward = normalised(places - centre)
             radius = np.linalg.norm(places - centre, axis=1).mean() * np.hypot(outward[:, 0], outward[:, 1])
@@ -195,7 +198,7 @@ class SkinPainter:
         """Mean resolution of the texture over the face, from the distance between the cheeks' landmarks."""
         uv = self._landmarks_uv((50, 280))
         return float(np.linalg.norm(uv[0] - uv[1]) * self.size
-                     / np.linalg.norm(self._landmarks[50] - self._landmarks[280]))
+                     / np.linalg.norm(self.landmarks[50] - self.landmarks[280]))
 
 
 def _along(points: np.ndarray, part: float) -> np.ndarray:

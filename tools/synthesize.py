@@ -95,7 +95,7 @@ def synthesize(destination: Path, settings: Settings, processes: int) -> None:
     """Makes the subject in `destination`, which may not hold one yet. Errors: InputError."""
     if (destination / "subject.yaml").exists():
         raise InputError("holds a subject already", where=str(destination), mend="choose another folder or remove it")
-    head = random_head(_model(settings.level), settings.seed, settings.eyes == "closed")
+    head = random_head(head_model(settings.level), settings.seed, settings.eyes == "closed")
     materials = SkinPainter(head, settings.texture, settings.seed).paint(Complexion(tone=settings.tone))
     lights = tuple(light_of(name, settings) for name in settings.lights)
     distance, height = camera_place(head, settings)
@@ -145,7 +145,8 @@ def _write_relight(folder: Path, settings: Settings, scene: Scene, shots: list[S
                                          zip(RELIGHT_YAWS_DEG, shots, strict=False)})
 
 
-def _model(level: int) -> HeadModel:
+def head_model(level: int) -> HeadModel:
+    """The head model, subdivided so often."""
     model = load_head_model()
     for _ in range(level):
         model = model.subdivided()
