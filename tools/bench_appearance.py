@@ -144,11 +144,14 @@ def _albedo_errors(truth: np.ndarray, found: np.ndarray, confidence: np.ndarray)
 
 def _confident_errors(truth: np.ndarray, found: np.ndarray, sure: np.ndarray) -> dict:
     """Where the clip saw light, with gains from there: what it did not see must not set them."""
+    if not sure.any():
+        return {f"confident_{name}": float("nan") for name in ("delta_e2000_median", "delta_e2000_p90", "psnr_linear")}
     truth, found = truth[sure].astype(np.float64), found[sure]
     found = found * score_measures.channel_gain(truth, found)
     apart = delta_e_2000(np.clip(truth, 0, None), np.clip(found, 0, None))
     return {
         "confident_delta_e2000_median": float(np.median(apart)),
+        "confident_delta_e2000_p90": float(np.percentile(apart, 90)),
         "confident_psnr_linear": score_measures.psnr(truth, found),
     }
 
