@@ -1,13 +1,16 @@
 # make demo    set-up, then the embedded subject from clip to scores
 # make test    set-up, then all tests
 # make setup   the set-up alone
+# make chart   set-up, then speed against accuracy on the embedded subject (20 minutes); CASES=all SUBJECT=DIR: more
 # make audit   licences, changed files, bill of materials; ADVISORIES=all.zip: known vulnerabilities, too
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+CASES ?= quick
+OUT ?= build/chart
 
-.PHONY: setup demo test lint audit clean
+.PHONY: setup demo test chart lint audit clean
 
 setup: $(STAMP)
 	$(BIN)/python -m tools.check_host
@@ -24,6 +27,9 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest
+
+chart: setup
+	$(BIN)/python -m tools.chart $(SUBJECT) --cases $(CASES) --out $(OUT)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -35,6 +35,10 @@ from tools.svg_file import save_line_chart
 FIELDS = ("label", "solver", "size", "seconds", "iteration", "delta_e2000_median", "delta_e2000_p90", "psnr_linear")
 FIXED_SHAPE = {"shape": False, "local_roughness": False}
 TRANSFER_SIZES: dict[str, dict] = {
+    "tiny": {
+        "points": 200, "directions": 128, "bounce_nodes": 50, "light_resolution": 4, "light_frames": 6,
+        "light_steps": 2, "map_size": 64, "search_roughness": False, **FIXED_SHAPE,
+    },
     "least": {
         "points": 300, "directions": 192, "bounce_nodes": 100, "light_resolution": 8, "light_frames": 10,
         "light_steps": 4, "map_size": 128, "search_roughness": False, **FIXED_SHAPE,

@@ -44,6 +44,7 @@ def mitsuba():
 
     module.set_variant(os.environ.get(VARIABLE, "scalar_rgb"))
     module.register_bsdf("limn_skin", lambda props: _skin_bsdf()(props))
+    module.register_bsdf("limn_skin_maps", lambda props: _mapped_skin_bsdf()(props))
     return module
 
 
@@ -56,25 +57,35 @@ def path_trace(
     Mitsuba's rows reach half a pixel further than ours.
     """
     mi = mitsuba()
+    integrator = {"type": "path", "max_depth": depth, "rr_depth": 1000, "hide_emitters": True}
+    scene = load_scene(mesh, latlong, camera, _bsdf(coat), integrator, samples)
+    return np.array(mi.render(scene, seed=seed, spp=samples))[..., :3]
+
+
+def load_scene(mesh: Mesh, latlong: np.ndarray, camera: Camera, bsdf: dict, integrator: dict, samples: int):
+    """Mitsuba's scene of one mesh, "shape", under one environment map, "light", seen by one "sensor"."""
+    mi = mitsuba()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.ply"
         path.write_bytes(_ply(mesh))
-        scene = mi.load_dict(
+        return mi.load_dict(
             {
                 "type": "scene",
-                "integrator": {"type": "path", "max_depth": depth, "rr_depth": 1000, "hide_emitters": True},
+                "integrator": integrator,
                 "sensor": _sensor(mi, camera, samples),
                 "light": {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(latlong, np.float32))},
-                "shape": {"type": "ply", "filename": str(path), "bsdf": _bsdf(coat)},
+                "shape": {"type": "ply", "filename": str(path), "bsdf": bsdf},
             }
         )
-        return np.array(mi.render(scene, seed=seed, spp=samples))[..., :3]
+
+
+def head_from_camera(camera_from_head: np.ndarray) -> np.ndarray:
+    """[4, 4] with the axes of Mitsuba's camera, which has x to the left and y up."""
+    return invert_rigid(camera_from_head) @ np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 def _sensor(mi, camera: Camera, samples: int) -> dict:
     width, height = camera.size
-    # Mitsuba's camera has x to the left and y up.
-    head_from_camera = invert_rigid(camera.camera_from_head) @ np.diag([-1.0, -1.0, 1.0, 1.0])
     film = {
         "type": "hdrfilm",
         "width": width,
@@ -89,7 +100,9 @@ def _sensor(mi, camera: Camera, samples: int) -> dict:
         "fov": float(np.degrees(2.0 * np.arctan(0.5 * width / camera.intrinsics[0, 0]))),
         "near_clip": 1.0,
         "far_clip": 1e5,
-        "to_world": mi.ScalarTransform4f(head_from_camera),
+        "to_world": mi.ScalarTransform4f(head_from_camera(camera.camera_from_head)),
+        "principal_point_offset_x": 0.5 - camera.intrinsics[0, 2] / width,
+        "principal_point_offset_y": 0.5 - camera.intrinsics[1, 2] / height,
         "film": film,
         "sampler": {"type": "independent", "sample_count": samples},
     }
@@ -104,16 +117,20 @@ def _bsdf(coat: Coat) -> dict:
 
 
 def _ply(mesh: Mesh) -> bytes:
-    """Binary PLY with the vertex normals that our renderer shades with."""
+    """Binary PLY with the vertex normals that our renderer shades with; vertices at seams of the texture twice."""
+    corners, corner = np.unique(np.stack([mesh.faces.ravel(), mesh.face_uvs.ravel()], 1), axis=0, return_inverse=True)
     header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(mesh.vertices)}\n"
-        + "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(corners)}\n"
+        + "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz", "u", "v"))
         + f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
     normals = vertex_normals(mesh.vertices, mesh.faces)
+    # Mitsuba's textures start in the upper row.
+    uvs = mesh.uvs[corners[:, 1]] * [1.0, -1.0] + [0.0, 1.0]
+    columns = np.hstack([mesh.vertices[corners[:, 0]], normals[corners[:, 0]], uvs])
     faces = np.zeros(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
-    faces["count"], faces["corners"] = 3, mesh.faces
-    return header.encode() + np.hstack([mesh.vertices, normals]).astype("<f4").tobytes() + faces.tobytes()
+    faces["count"], faces["corners"] = 3, corner.reshape(-1, 3)
+    return header.encode() + columns.astype("<f4").tobytes() + faces.tobytes()
 
 
 @cache
@@ -127,13 +144,20 @@ def _skin_bsdf():
 
         def __init__(self, props):
             mi.BSDF.__init__(self, props)
-            self.albedo = mi.Color3f(props["red"], props["green"], props["blue"])
-            self.intensity, self.alpha = props["specular_intensity"], props["roughness"] ** 2
+            self.read(props)
             flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
             self.m_components, self.m_flags = [flags], flags
 
+        def read(self, props):
+            self.albedo = mi.Color3f(props["red"], props["green"], props["blue"])
+            self.intensity, self.alpha = props["specular_intensity"], props["roughness"] ** 2
+
+        def material(self, si, active):
+            return self.albedo, self.intensity, self.alpha
+
         def sample(self, ctx, si, sample1, sample2, active=True):
-            tangent2 = self.alpha**2 * sample2.x / dr.maximum(1.0 - sample2.x, 1e-7)
+            alpha = self.material(si, active)[2]
+            tangent2 = alpha**2 * sample2.x / dr.maximum(1.0 - sample2.x, 1e-7)
             cosine = 1.0 / dr.sqrt(1.0 + tangent2)
             sine, azimuth = dr.sqrt(dr.maximum(0.0, 1.0 - cosine**2)), 2.0 * dr.pi * sample2.y
             half = mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), cosine)
@@ -152,11 +176,12 @@ def _skin_bsdf():
             return self.eval_pdf(ctx, si, wo, active)[1]
 
         def eval_pdf(self, ctx, si, wo, active=True):
+            albedo, intensity, alpha = self.material(si, active)
             cos_i, cos_o = si.wi.z, wo.z
             above = active & (cos_i > 1e-6) & (cos_o > 1e-6)
             half = dr.normalize(si.wi + wo)
             tangent2 = (half.x**2 + half.y**2) / dr.maximum(half.z**2, 1e-12)
-            alpha2, cos_h = self.alpha**2, dr.maximum(half.z, 1e-6)
+            alpha2, cos_h = alpha**2, dr.maximum(half.z, 1e-6)
             distribution = alpha2 / (dr.pi * cos_h**4 * (alpha2 + tangent2) ** 2)
             masking = 1.0
             for cosine in (cos_i, cos_o):
@@ -164,8 +189,8 @@ def _skin_bsdf():
                 masking *= 2.0 / (1.0 + dr.sqrt(1.0 + alpha2 * steep2))
             toward = dr.maximum(dr.dot(wo, half), 1e-6)
             fresnel = 0.04 + 0.96 * (1.0 - toward) ** 5
-            lobe = self.intensity * distribution * masking * fresnel / (4.0 * dr.maximum(cos_i, 1e-6))
-            value = self.albedo * (cos_o / dr.pi) + mi.Color3f(lobe)
+            lobe = intensity * distribution * masking * fresnel / (4.0 * dr.maximum(cos_i, 1e-6))
+            value = albedo * (cos_o / dr.pi) + mi.Color3f(lobe)
             pdf = 0.5 * cos_o / dr.pi + 0.5 * distribution * cos_h / (4.0 * toward)
             return dr.select(above, value, mi.Color3f(0.0)), dr.select(above, pdf, 0.0)
 
@@ -173,3 +198,29 @@ def _skin_bsdf():
             return "Skin[]"
 
     return Skin
+
+
+@cache
+def _mapped_skin_bsdf():
+    """The same with textures: albedo, and specular_intensity and roughness in one channel each."""
+    import mitsuba as mi
+
+    class MappedSkin(_skin_bsdf()):
+        """Its textures are parameters that can be differentiated."""
+
+        def read(self, props):
+            self.maps = {name: props[name] for name in ("albedo", "specular_intensity", "roughness")}
+
+        def traverse(self, callback):
+            for name, texture in self.maps.items():
+                callback.put(name, texture, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys):
+            pass
+
+        def material(self, si, active):
+            maps = self.maps
+            intensity, roughness = (maps[name].eval_1(si, active) for name in ("specular_intensity", "roughness"))
+            return mi.Color3f(maps["albedo"].eval_3(si, active)), intensity, roughness**2
+
+    return MappedSkin

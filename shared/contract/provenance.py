@@ -30,7 +30,7 @@ class Meter:
         """{"started", "wall_s", "cpu_s", "peak_memory_mb"}."""
         self._stop.set()
         self._thread.join()
-        peak = max(self._peak, _own_peak_bytes(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024)
+        peak = max(self._peak, own_peak_bytes(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024)
         return {
             "started": self.started,
             "wall_s": round(time.perf_counter() - self._wall, 3),
@@ -63,7 +63,7 @@ def _cpu_seconds() -> float:
     return own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime
 
 
-def _own_peak_bytes() -> int:
+def own_peak_bytes() -> int:
     """High-water mark since exec; getrusage would also count what the parent had before it."""
     with contextlib.suppress(OSError), open("/proc/self/status", encoding="ascii") as file:
         for line in file:

@@ -1,0 +1,215 @@
+"""The chart of speed against accuracy: its cases, its measuring, its table, its pictures."""
+
+import csv
+import sys
+
+import pytest
+from browser import Browser, chromium
+from toy_runs import TOY, make_subject
+
+from shared.contract.confine import trust
+from shared.contract.pipeline import load_pipeline
+from shared.contract.subject import load_subject
+from shared.errors import InputError
+from shared.io.arrays import read_json
+from tools import tradeoff_runs
+from tools.tradeoff_cases import ABLATIONS, GROUPS, PEER, PRESET, QUICK, ChartCase, all_cases, chosen_cases
+from tools.tradeoff_page import tradeoff_page
+from tools.tradeoff_rows import Rows, csv_row, higher_is_better, pareto_front, row_costs, summarise
+from tools.tradeoff_runs import Cost, Runs, Solved, fingerprints, measured
+from tools.tradeoff_scores import flat
+from tools.tradeoff_svg import Scale, log_ticks, tradeoff_svg
+
+ERROR, LIKENESS = "albedo.aligned.delta_e2000_median", "albedo.aligned.psnr_linear"
+CLIP = {"frames": 48, "height": 400}
+
+
+def point(name, seconds, error, group="ablation", **more):
+    return {
+        "name": name, "group": group, "settings": [name], "repeats": 2, "seconds": seconds, "cpu_seconds": 2 * seconds,
+        "peak_mb": 500.0, "others": 0.0, "seconds_range": [0.9 * seconds, 1.1 * seconds],
+        "stages": {"inverse_render": seconds}, "scores": {ERROR: error, LIKENESS: 40.0 - error}, **more,
+    }  # fmt: skip
+
+
+POINTS = [
+    point("draft", 60.0, 2.0, PRESET), point("standard", 300.0, 1.0, PRESET), point("fine", 900.0, 1.1, PRESET),
+    point("draft, matte", 40.0, 2.5), point("draft, no bounce", 70.0, 2.2), point("Mitsuba, 120 s", 160.0, 3.0, PEER),
+]  # fmt: skip
+
+
+# ---------------------------------------------------------------- cases
+@pytest.mark.parametrize(("which", "base"), [("quick", "draft"), ("all", "standard")])
+def test_every_case_differs_from_its_base_and_from_the_others(which, base):
+    cases = all_cases(load_pipeline(), base, which, CLIP)
+    names = [case.name for case in cases]
+    assert len(set(names)) == len(names) and {case.group for case in cases} == set(GROUPS)
+    assert {"draft", "standard"} <= set(names) and ("fine" in names) == (which == "all")
+    assert f"{base}, 12 frames" in names and f"{base}, no visibility" in names
+    # What the clip does not have, and what the preset does anyway, would be the base again.
+    assert not {f"{base}, 48 frames", f"{base}, 250 frames", f"{base}, 1024 px"} & set(names)
+    assert f"{base}, {load_pipeline().parameters(load_pipeline().stages['inverse_render'], base, {})['directions']} " \
+           "directions" not in names
+
+
+def test_a_larger_clip_has_more_cases():
+    few, many = (all_cases(load_pipeline(), "standard", "all", {"frames": n, "height": px}) for n, px in
+                 ((48, 400), (300, 1080)))  # fmt: skip
+    assert {case.name for case in many} - {case.name for case in few} >= {"standard, 96 frames", "standard, 720 px"}
+    assert set(QUICK) <= set(ABLATIONS)
+
+
+def test_words_choose_cases():
+    cases = all_cases(load_pipeline(), "draft", "quick", CLIP)
+    assert [case.name for case in chosen_cases(cases, ["matte", "standard"])] == ["draft, matte", "standard"]
+    with pytest.raises(InputError, match="no such case.*sparkle"):
+        chosen_cases(cases, ["sparkle"])
+
+
+# ---------------------------------------------------------------- measuring
+def test_a_process_is_measured(tmp_path):
+    work = "import time; t = time.process_time()\nwhile time.process_time() < t + 0.3: pass"
+    cost = measured([sys.executable, "-c", f"{work}\ntime.sleep(0.3)"], tmp_path / "log")
+    assert cost["wall_s"] > 0.55 and 0.28 < cost["cpu_s"] < cost["wall_s"] and cost["others"] >= 0.0
+    with pytest.raises(InputError, match="the last word.*exit code 3"):
+        measured([sys.executable, "-c", "print('the last word'); raise SystemExit(3)"], tmp_path / "log")
+
+
+@pytest.fixture
+def toy(tmp_path, monkeypatch):
+    """Runs over the toy pipeline, whose draw_bars stands for the solver."""
+    monkeypatch.setattr(tradeoff_runs, "_SOLVED", "draw_bars")
+    monkeypatch.setattr(tradeoff_runs, "_EXPORTED", "export_page")
+    trust([TOY])
+    subject = load_subject(make_subject(tmp_path / "poem"))
+    return Runs(tmp_path / "work", subject, load_pipeline(TOY / "pipeline.yaml"), sys.executable)
+
+
+def test_cases_share_the_stages_that_they_have_in_common(toy):
+    narrow = ChartCase("narrow", "ablation", "standard", ("draw_bars.width=2",))
+    first, second = toy.solve(ChartCase("plain", PRESET, "standard"))[0], toy.solve(narrow)[0]
+    assert first.digest != second.digest
+    assert set(first.costs) == {"read_text", "count_words", "draw_bars", "export_page"}
+    assert set(second.costs) == {"read_text", "count_words", "draw_bars"}
+    assert first.costs["count_words"] == second.costs["count_words"] != first.costs["draw_bars"]
+    assert len(list(toy.work.glob("*/measured.json"))) == 5
+
+
+def test_what_is_done_is_kept_until_its_code_changes(toy, monkeypatch):
+    case = ChartCase("plain", "ablation", "standard")
+    first = toy.solve(case)[0]
+    assert toy.solve(case)[0].costs == first.costs
+    monkeypatch.setitem(tradeoff_runs._known, next(name for name in first.code if "draw_bars" in name), "changed")
+    again = toy.solve(case)[0]
+    assert again.costs["count_words"] == first.costs["count_words"]
+    assert again.costs["draw_bars"] != first.costs["draw_bars"] and again.digest == first.digest
+    assert "changed" not in again.code.values()
+
+
+def test_a_stage_that_fails_says_why_and_leaves_the_earlier_ones(toy, monkeypatch):
+    monkeypatch.setenv("TOY_FAIL", "1")
+    with pytest.raises(InputError, match="abacus|count_words"):
+        toy.solve(ChartCase("plain", PRESET, "standard"))
+    assert [read_json(path)["stage"] for path in toy.work.glob("*/measured.json")] == ["read_text"]
+
+
+# ---------------------------------------------------------------- the table
+def solved(seconds, digest="d0"):
+    costs = {"sample_frames": Cost(5.0, 6.0, 100.0, 0.5), "inverse_render": Cost(seconds, 2 * seconds, 900.0, 0.0),
+             "export_usd": Cost(7.0, 7.0, 1500.0, 0.0)}  # fmt: skip
+    return Solved(None, digest, costs, fingerprints(["tools/tradeoff_rows.py"]))
+
+
+@pytest.fixture
+def rows(tmp_path):
+    found = Rows.open(tmp_path / "chart.json", "someone", "key")
+    case = ChartCase("draft", PRESET, "draft")
+    for repeat, seconds in enumerate((20.0, 10.0, 15.0)):
+        found.add(case, repeat, 2, solved(seconds), {ERROR: 1.5, "pose.frames": 48.0})
+    found.save()
+    return found
+
+
+def test_rows_come_back_as_long_as_code_and_subject_are_the_same(rows, monkeypatch):
+    case = ChartCase("draft", PRESET, "draft")
+    again = Rows.open(rows.path, "someone", "key")
+    assert again.rows == rows.rows and again.dropped == 0
+    assert again.has(case, 2, 2) and not again.has(case, 3, 2) and not again.has(case, 2, 1)
+    assert not again.has(ChartCase("draft", PRESET, "draft", ("a.b=1",)), 2, 2)
+    assert again.scores_of("d0")[ERROR] == 1.5 and again.scores_of("other") is None
+    assert Rows.open(rows.path, "someone", "another clip").dropped == 3
+    monkeypatch.setitem(tradeoff_runs._known, "tools/tradeoff_rows.py", "changed")
+    stale = Rows.open(rows.path, "someone", "key")
+    assert stale.rows == [] and stale.dropped == 3
+
+
+def test_a_peer_is_measured_when_all_its_seconds_are(rows):
+    case = ChartCase("Mitsuba", PEER, "draft", seconds=(60.0, 120.0))
+    for at in case.seconds:
+        assert not rows.has(case, 0, 2)
+        rows.add(case, 0, 2, Solved(None, f"m{at}", {"Mitsuba": Cost(at, at, 1.0, 0.0)}, {}, at), {ERROR: 3.0})
+    assert rows.has(case, 0, 2) and rows.rows[-1]["case"] == "Mitsuba, 120 s"
+
+
+def test_costs_are_those_up_to_the_maps(rows):
+    costs = row_costs(rows.rows[0])
+    assert costs["seconds"] == 25.0 and costs["seconds_with_export"] == 32.0
+    assert costs["cpu_seconds"] == 46.0 and costs["peak_mb"] == 900.0 and costs["others"] == 0.1
+    with open(rows.path.with_suffix(".csv"), encoding="utf-8") as file:
+        table = list(csv.DictReader(file))
+    assert len(table) == 3 and float(table[1]["inverse_render_s"]) == 10.0 and float(table[0][ERROR]) == 1.5
+    assert csv_row(rows.rows[0])["settings"] == "draft"
+
+
+def test_repeats_become_their_median(rows):
+    (found,) = summarise(rows.rows)
+    assert found["seconds"] == 20.0 and found["seconds_range"] == [15.0, 25.0] and found["repeats"] == 3
+    assert found["stages"]["inverse_render"] == 15.0 and found["scores"][ERROR] == 1.5
+
+
+def test_the_front_holds_what_nothing_beats():
+    assert pareto_front(POINTS, ERROR) == ["draft, matte", "draft", "standard"]
+    assert pareto_front(POINTS, LIKENESS) == ["draft, matte", "draft", "standard"]
+    assert pareto_front(POINTS, ERROR, "peak_mb") == ["standard"]
+    assert not higher_is_better(ERROR) and higher_is_better(LIKENESS) and higher_is_better("mask_coverage")
+
+
+def test_scores_become_flat():
+    albedo = {"gain": [1.0, 2.0], "raw": {"psnr": 30.123456789}}
+    nested = {"subject": "x", "albedo": albedo, "frames": 3, "bad": float("nan")}
+    assert flat(nested) == {"albedo.gain.0": 1.0, "albedo.gain.1": 2.0, "albedo.raw.psnr": 30.12346, "frames": 3.0}
+
+
+# ---------------------------------------------------------------- the pictures
+def test_the_axis_is_logarithmic():
+    scale = Scale(1.0, 1000.0, 0.0, 300.0, logarithmic=True)
+    assert [round(scale(value)) for value in (1, 10, 100, 1000, 5000)] == [0, 100, 200, 300, 300]
+    assert log_ticks(3.0, 60.0) == [5.0, 10.0, 20.0, 50.0]
+
+
+def test_the_picture_names_the_presets_and_the_front():
+    svg = tradeoff_svg(POINTS, ERROR, "error")
+    assert svg.count("<circle") == len(POINTS) + 3
+    for name in ("draft", "standard", "fine"):
+        assert 'class="preset" x=' in svg and f">{name}</text>" in svg
+    assert ">draft, matte</text>" in svg and 'class="front"' in svg
+    assert "http" not in svg.replace('xmlns="http://www.w3.org/2000/svg"', "")
+
+
+@pytest.mark.skipif(chromium() is None, reason="needs Chromium on the path or in LIMN_CHROMIUM")
+def test_the_page_answers(tmp_path):
+    path = tmp_path / "chart.html"
+    path.write_text(tradeoff_page(POINTS, ERROR, "a </script> clip", GROUPS), encoding="utf-8")
+    with Browser(1000, 900) as page:
+        page.open(path)
+        assert page.evaluate("document.querySelectorAll('#chart circle').length") == len(POINTS)
+        front = "[...document.querySelectorAll('#rows tr.front td:first-child')].map(c => c.textContent).join()"
+        assert page.evaluate(front) == "draft, matte,draft,standard"
+        page.evaluate("at('cost').value = 'peak_mb'; at('cost').dispatchEvent(new Event('change'))")
+        assert page.evaluate(front) == "standard"
+        page.click("#rows tr:nth-child(2)")
+        chosen = page.evaluate("document.querySelector('tr.chosen td').textContent")
+        assert page.evaluate("document.getElementById('about').textContent").startswith(chosen)
+        page.click("#groups input")
+        assert page.evaluate("document.querySelectorAll('#chart circle').length") == len(POINTS) - 3
+        assert page.problems == [] and page.requests == [path.resolve().as_uri()]

@@ -1,0 +1,35 @@
+"""The chart of tools/chart.py as one interactive page: any score over any cost, with the Pareto front of the two."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from string import Template
+
+from tools.tradeoff_rows import higher_is_better
+from tools.tradeoff_svg import GROUP_COLOURS
+
+TEMPLATE = Path(__file__).with_name("tradeoff_page.html")
+COSTS = {
+    "seconds": "seconds from the clip to the maps",
+    "cpu_seconds": "processor seconds",
+    "peak_mb": "peak memory, MB",
+    "seconds_with_export": "seconds with the export",
+}
+
+
+def tradeoff_page(points: Sequence[Mapping], measure: str, subject: str, groups: Mapping[str, str]) -> str:
+    """points: see tradeoff_rows.summarise. A page that asks for nothing outside of itself."""
+    measures = sorted({name for point in points for name in point["scores"]})
+    data = {
+        "points": list(points),
+        "measures": {name: higher_is_better(name) for name in measures},
+        "measure": measure,
+        "costs": COSTS,
+        "groups": [[name, text, GROUP_COLOURS[name]] for name, text in groups.items()],
+    }
+    text = json.dumps(data, allow_nan=False).replace("</", "<\\/")
+    template = Template(TEMPLATE.read_text(encoding="utf-8"))
+    return template.substitute(title=f"Speed against accuracy: {escape(subject)}", data=text)

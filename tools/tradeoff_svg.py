@@ -1,0 +1,145 @@
+"""Accuracy over seconds as a picture: a point per case, the Pareto front, presets by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+
+from shared.report.charts import COLOURS, nice_ticks
+from tools.tradeoff_cases import GROUPS, PRESET
+from tools.tradeoff_rows import pareto_front
+
+WIDTH, HEIGHT = 860, 520
+LEFT, RIGHT, TOP, BOTTOM = 66, 24, 18, 86
+GROUP_COLOURS = dict(zip(GROUPS, (COLOURS[0], "#56b4e9", COLOURS[1], COLOURS[3]), strict=True))
+CHARACTER, LINE = 5.9, 13.0
+"""Width and height of a label's text in the drawing's units, roughly."""
+_STYLE = (
+    "text{font:11px sans-serif;fill:#444}.preset{font-weight:bold;font-size:13px;fill:#111}.grid{stroke:#e4e4e4}"
+    ".front{stroke:#111;fill:none;stroke-dasharray:5 3}.range{stroke-width:1.4;opacity:.6}.lead{stroke:#bbb}"
+)
+
+
+class Scale:
+    """Value -> place along an axis, logarithmic where told; kept within its ends."""
+
+    def __init__(self, low: float, high: float, start: float, end: float, logarithmic: bool):
+        self._of = math.log10 if logarithmic else float
+        self._low, self._span = self._of(low), self._of(high) - self._of(low)
+        self._start, self._end = start, end
+
+    def __call__(self, value: float) -> float:
+        share = min(max((self._of(value) - self._low) / self._span, 0.0), 1.0)
+        return self._start + share * (self._end - self._start)
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """1, 2 and 5 times the powers of ten between low and high."""
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    return [m * 10.0**p for p in powers for m in (1, 2, 5) if low <= m * 10.0**p <= high]
+
+
+def tradeoff_svg(points: Sequence[Mapping], measure: str, title: str, groups: Mapping[str, str] = GROUPS) -> str:
+    """points: see tradeoff_rows.summarise; those without the measure are left out. An .svg file's text."""
+    points = [point for point in points if measure in point["scores"]]
+    seconds = [value for point in points for value in point["seconds_range"]]
+    values = [point["scores"][measure] for point in points]
+    margin = 0.08 * (max(values) - min(values)) or 0.5
+    low, high = min(values) - margin, max(values) + margin
+    across = Scale(min(seconds) / 1.25, max(seconds) * 1.25, LEFT, WIDTH - RIGHT, logarithmic=True)
+    down = Scale(low, high, HEIGHT - BOTTOM, TOP, logarithmic=False)
+    places = {point["name"]: (across(point["seconds"]), down(point["scores"][measure])) for point in points}
+    front = pareto_front(points, measure)
+    parts = [*_axes(across, down, (min(seconds) / 1.25, max(seconds) * 1.25), (low, high), title)]
+    parts.append(_front([places[name] for name in front]))
+    parts += [_point(point, places[point["name"]], across) for point in points]
+    parts += _labels(points, places, front)
+    parts += _legend(groups, {point["group"] for point in points})
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}"><style>{_STYLE}</style>'
+    return f'{head}<rect width="{WIDTH}" height="{HEIGHT}" fill="#fff"/>{"".join(parts)}</svg>\n'
+
+
+def _axes(across: Scale, down: Scale, x_span: tuple, y_span: tuple, title: str) -> list[str]:
+    bottom, parts = HEIGHT - BOTTOM, []
+    for tick in log_ticks(*x_span):
+        x = across(tick)
+        parts.append(f'<path class="grid" d="M{x:.1f} {TOP}V{bottom}"/>')
+        parts.append(f'<text x="{x:.1f}" y="{bottom + 16}" text-anchor="middle">{tick:g}</text>')
+    for tick in nice_ticks(*y_span):
+        y = down(tick)
+        parts.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>')
+        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{tick:.4g}</text>')
+    middle = (LEFT + WIDTH - RIGHT) / 2
+    label = "seconds from the clip to the maps"
+    parts.append(f'<text x="{middle}" y="{bottom + 34}" text-anchor="middle">{label}</text>')
+    turned = f'transform="translate(16 {(TOP + bottom) / 2}) rotate(-90)"'
+    return [*parts, f'<text {turned} text-anchor="middle">{escape(title)}</text>']
+
+
+def _front(places: Sequence[tuple[float, float]]) -> str:
+    """Steps: up to the next point's seconds nothing better is to be had."""
+    path = f"M{places[0][0]:.1f} {places[0][1]:.1f}" + "".join(f"H{x:.1f}V{y:.1f}" for x, y in places[1:])
+    return f'<path class="front" d="{path}"/>'
+
+
+def _point(point: Mapping, place: tuple[float, float], across: Scale) -> str:
+    (x, y), colour = place, GROUP_COLOURS[point["group"]]
+    first, last = (across(value) for value in point["seconds_range"])
+    radius = 6.5 if point["group"] == PRESET else 4
+    seconds = f"{point['name']}: {point['seconds']:.0f} s"
+    return (
+        f'<path class="range" stroke="{colour}" d="M{first:.1f} {y:.1f}H{last:.1f}"/>'
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius}" fill="{colour}"><title>{escape(seconds)}</title></circle>'
+    )
+
+
+def _labels(points: Sequence[Mapping], places: Mapping, front: Sequence[str]) -> list[str]:
+    """Names beside their points where there is room, presets and the front first; the others only where they fit."""
+    taken = [(x - 5, y - 5, x + 5, y + 5) for x, y in places.values()]
+    order = sorted(points, key=lambda point: (point["group"] != PRESET, point["name"] not in front))
+    parts = []
+    for point in order:
+        named = point["group"] == PRESET
+        (x, y), text = places[point["name"]], point["name"]
+        width, height = len(text) * CHARACTER * (1.25 if named else 1.0), LINE
+        box = _free_box(x, y, width, height, taken, must=named or text in front)
+        if box is None:
+            continue
+        taken.append(box)
+        left, base = box[0], box[3] - 3
+        style = ' class="preset"' if named else ""
+        if abs(base - y) > 2.2 * LINE:
+            parts.append(f'<path class="lead" d="M{x:.1f} {y:.1f}L{left + width / 2:.1f} {base - 4:.1f}"/>')
+        parts.append(f'<text{style} x="{left:.1f}" y="{base:.1f}">{escape(text)}</text>')
+    return parts
+
+
+def _free_box(x: float, y: float, width: float, height: float, taken: Sequence, must: bool) -> tuple | None:
+    """Left, top, right, bottom of a free place near a point; must: else farther away, at last the first one."""
+    reach = (0, 1, 2, 3, 4, 5) if must else (0, 1)
+    shifts = [sign * k * height for k in reach for sign in ((1,) if k == 0 else (-1, 1))]
+    boxes = []
+    for shift in shifts:
+        for left in (x + 9, x - 9 - width, x - width / 2):
+            top = y - height / 2 + shift
+            box = left, top, left + width, top + height
+            if left > LEFT and left + width < WIDTH - 4 and top > 2 and top + height < HEIGHT - BOTTOM:
+                boxes.append(box)
+    free = [box for box in boxes if not any(_overlap(box, other) for other in taken)]
+    return free[0] if free else boxes[0] if must and boxes else None
+
+
+def _overlap(a: Sequence[float], b: Sequence[float]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def _legend(groups: Mapping[str, str], present: set[str]) -> list[str]:
+    y, x, parts = HEIGHT - 14, float(LEFT), []
+    for group, text in groups.items():
+        if group in present:
+            parts.append(f'<circle cx="{x + 4:.0f}" cy="{y - 4}" r="4" fill="{GROUP_COLOURS[group]}"/>')
+            parts.append(f'<text x="{x + 13:.0f}" y="{y}">{escape(text)}</text>')
+            x += 30 + len(text) * CHARACTER
+    parts.append(f'<path class="front" d="M{x:.0f} {y - 4}h24"/><text x="{x + 30:.0f}" y="{y}">Pareto front</text>')
+    return parts
