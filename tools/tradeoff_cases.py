@@ -40,7 +40,7 @@ QUICK = ("12 frames", "256 px", "128 directions", "2048 directions", "map 256", 
          "no bounce", "no visibility", "matte")  # fmt: skip
 LIGHTENED = {
     "solver": "reference", "map_size": 256, "reference_pixels": 3000, "reference_light_samples": 48,
-    "reference_cosine_samples": 48, "reference_lobe_samples": 16, "reference_light_resolution": 32,
+    "reference_cosine_samples": 48, "reference_lobe_samples": 16, "reference_light_resolution": 64,
     "reference_vertices": False, "reference_light_rate": 0.03, "reference_texture_rate": 0.005,
 }  # fmt: skip
 """The published algorithm, five to seven times cheaper per iteration and faster in its textures; mesh held still."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
 from shared.report.charts import COLOURS, nice_ticks
-from tools.tradeoff_cases import GROUPS, PRESET
+from tools.tradeoff_cases import ABLATION, GROUPS, PRESET
 from tools.tradeoff_rows import pareto_front
 
 WIDTH, HEIGHT = 860, 520
@@ -15,6 +15,7 @@ LEFT, RIGHT, TOP, BOTTOM = 66, 24, 18, 86
 GROUP_COLOURS = dict(zip(GROUPS, (COLOURS[0], "#56b4e9", COLOURS[1], COLOURS[3]), strict=True))
 CHARACTER, LINE = 5.9, 13.0
 """Width and height of a label's text in the drawing's units, roughly."""
+SPREAD = 3.0
 _STYLE = (
     "text{font:11px sans-serif;fill:#444}.preset{font-weight:bold;font-size:13px;fill:#111}.grid{stroke:#e4e4e4}"
     ".front{stroke:#111;fill:none;stroke-dasharray:5 3}.range{stroke-width:1.4;opacity:.6}.lead{stroke:#bbb}"
@@ -45,13 +46,16 @@ def tradeoff_svg(points: Sequence[Mapping], measure: str, title: str, groups: Ma
     points = [point for point in points if measure in point["scores"]]
     seconds = [value for point in points for value in point["seconds_range"]]
     values = [point["scores"][measure] for point in points]
+    spread = is_spread(values)
     margin = 0.08 * (max(values) - min(values)) or 0.5
-    low, high = min(values) - margin, max(values) + margin
-    across = Scale(min(seconds) / 1.25, max(seconds) * 1.25, LEFT, WIDTH - RIGHT, logarithmic=True)
-    down = Scale(low, high, HEIGHT - BOTTOM, TOP, logarithmic=False)
+    y_span = (min(values) / 1.1, max(values) * 1.1) if spread else (min(values) - margin, max(values) + margin)
+    x_span = min(seconds) / 1.25, max(seconds) * 1.25
+    across = Scale(*x_span, LEFT, WIDTH - RIGHT, logarithmic=True)
+    down = Scale(*y_span, HEIGHT - BOTTOM, TOP, logarithmic=spread)
     places = {point["name"]: (across(point["seconds"]), down(point["scores"][measure])) for point in points}
     front = pareto_front(points, measure)
-    parts = [*_axes(across, down, (min(seconds) / 1.25, max(seconds) * 1.25), (low, high), title)]
+    parts = _ticks(across, down, log_ticks(*x_span), log_ticks(*y_span) if spread else nice_ticks(*y_span))
+    parts += _titles(title)
     parts.append(_front([places[name] for name in front]))
     parts += [_point(point, places[point["name"]], across) for point in points]
     parts += _labels(points, places, front)
@@ -60,21 +64,31 @@ def tradeoff_svg(points: Sequence[Mapping], measure: str, title: str, groups: Ma
     return f'{head}<rect width="{WIDTH}" height="{HEIGHT}" fill="#fff"/>{"".join(parts)}</svg>\n'
 
 
-def _axes(across: Scale, down: Scale, x_span: tuple, y_span: tuple, title: str) -> list[str]:
+def is_spread(values: Sequence[float]) -> bool:
+    """Whether a logarithmic axis shows these values better: all positive, the largest over three times the least."""
+    return min(values) > 0.0 and max(values) > SPREAD * min(values)
+
+
+def _ticks(across: Scale, down: Scale, x_ticks: Iterable[float], y_ticks: Iterable[float]) -> list[str]:
     bottom, parts = HEIGHT - BOTTOM, []
-    for tick in log_ticks(*x_span):
+    for tick in x_ticks:
         x = across(tick)
         parts.append(f'<path class="grid" d="M{x:.1f} {TOP}V{bottom}"/>')
         parts.append(f'<text x="{x:.1f}" y="{bottom + 16}" text-anchor="middle">{tick:g}</text>')
-    for tick in nice_ticks(*y_span):
+    for tick in y_ticks:
         y = down(tick)
         parts.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>')
         parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{tick:.4g}</text>')
-    middle = (LEFT + WIDTH - RIGHT) / 2
-    label = "seconds from the clip to the maps"
-    parts.append(f'<text x="{middle}" y="{bottom + 34}" text-anchor="middle">{label}</text>')
+    return parts
+
+
+def _titles(title: str) -> list[str]:
+    middle, bottom = (LEFT + WIDTH - RIGHT) / 2, HEIGHT - BOTTOM
     turned = f'transform="translate(16 {(TOP + bottom) / 2}) rotate(-90)"'
-    return [*parts, f'<text {turned} text-anchor="middle">{escape(title)}</text>']
+    return [
+        f'<text x="{middle}" y="{bottom + 34}" text-anchor="middle">seconds from the clip to the maps</text>',
+        f'<text {turned} text-anchor="middle">{escape(title)}</text>',
+    ]
 
 
 def _front(places: Sequence[tuple[float, float]]) -> str:
@@ -101,9 +115,11 @@ def _labels(points: Sequence[Mapping], places: Mapping, front: Sequence[str]) ->
     parts = []
     for point in order:
         named = point["group"] == PRESET
-        (x, y), text = places[point["name"]], point["name"]
+        x, y = places[point["name"]]
+        # An ablation is named after its preset, which the legend says for all of them.
+        text = point["name"].partition(", ")[2] if point["group"] == ABLATION else point["name"]
         width, height = len(text) * CHARACTER * (1.25 if named else 1.0), LINE
-        box = _free_box(x, y, width, height, taken, must=named or text in front)
+        box = _free_box(x, y, width, height, taken, must=named or point["name"] in front)
         if box is None:
             continue
         taken.append(box)
