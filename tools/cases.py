@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from shared.contract.declare import Stage
 from shared.contract.folders import RunFolder
 from shared.contract.pipeline import Pipeline, split_settings
 from shared.contract.subject import Subject, load_subject
@@ -24,15 +25,32 @@ class InputErrors(InputError):
 
 @dataclass(frozen=True)
 class Case:
-    """One subject with the folder that its run goes to."""
+    """One subject with the folder that its run goes to; or one clip of a subject that has several: clip is its name."""
 
     subject: Subject
     run: RunFolder
+    clip: str = ""
 
     @property
     def name(self) -> str:
         """The subject's name."""
         return self.subject.name
+
+    def jobs(self, pipeline: Pipeline) -> list[tuple[Case, str]]:
+        """What there is to do, in order: the case and the stage, where a case of several clips stands for the stages
+        that work on all of them, and each clip is a case of its own for the others."""
+        clips = [Case(clip, self.run.of_clip(clip.name), clip.name) for clip in self.subject.clips]
+        joint = pipeline.joint if clips else pipeline.steps
+        return [(case, name) for case in clips for name in pipeline.steps if name not in joint] + [
+            (self, name) for name in pipeline.steps if name in joint]
+
+    def inputs(self, stage: Stage) -> dict[str, Path]:
+        """{name: folder} of what a stage of this case reads; of each clip as clip/name where it joins them."""
+        return self.run.inputs(stage, [clip.name for clip in self.subject.clips])
+
+    def label(self, stage: str) -> str:
+        """The stage's name, with that of the clip where the subject has several."""
+        return f"{self.clip}/{stage}" if self.clip else stage
 
 
 @dataclass(frozen=True)

@@ -76,12 +76,11 @@ def scratch_folder(run: RunFolder) -> Iterator[Path]:
 def configure(scratches: Sequence[Path], cases: Sequence[Case], settings: Settings) -> list[list[Track]]:
     """Writes Snakemake's configuration into the first scratch folder; returns each subject's stages to watch."""
     pipeline, runs, tracks, home = settings.pipeline, {}, [], scratches[0]
-    for i, (case, scratch) in enumerate(zip(cases, scratches, strict=True)):
-        (home / "runs" / str(i)).symlink_to(case.run.root, target_is_directory=True)
-        events = {name: scratch / EVENTS / f"{name}.jsonl" for name in pipeline.steps}
-        runs[str(i)] = {name: _command(name, case, settings, path) for name, path in events.items()}
-        tracks.append([Track(case.name, name, path) for name, path in events.items()])
-    stages = {name: {"needs": list(step.needs), "threads": settings.threads_of(name, len(cases)),
+    for case, scratch in zip(cases, scratches, strict=True):
+        own, watched = _configure_case(case, scratch / EVENTS, settings, home / "runs", len(runs))
+        runs |= own
+        tracks.append(watched)
+    stages = {name: {"threads": settings.threads_of(name, len(cases)),
                      "resources": {kind: dict(step.resources[kind]) for kind in KINDS if kind in step.resources}}
               for name, step in pipeline.steps.items()}
     scale = asdict(scale_of(pipeline.sizes, pipeline.stages, settings.parameters, str(pipeline.path)))
@@ -91,11 +90,37 @@ def configure(scratches: Sequence[Path], cases: Sequence[Case], settings: Settin
     return tracks
 
 
+def _configure_case(case: Case, events: Path, settings: Settings, links: Path, first: int) -> tuple[dict, list[Track]]:
+    """{number: {stage: its command and the stamps that it waits for}} from the number first on, and what to watch.
+
+    A number stands for the subject, or for one of its clips.
+    """
+    runs: dict[str, dict[str, dict]] = {}
+    numbers: dict[str, str] = {}
+    stamps: dict[str, str] = {}
+    tracks = []
+    for part, name in case.jobs(settings.pipeline):
+        if part.clip not in numbers:
+            number = numbers[part.clip] = str(first + len(numbers))
+            part.run.root.mkdir(parents=True, exist_ok=True)
+            (links / number).symlink_to(part.run.root, target_is_directory=True)
+        number, label = numbers[part.clip], part.label(name)
+        path = events / f"{label}.jsonl"
+        path.parent.mkdir(exist_ok=True)
+        needs = [stamps[part.label(need)] for need in part.inputs(settings.pipeline.stages[name])]
+        stamps[label] = f"runs/{number}/work/{name}.stamp"
+        runs.setdefault(number, {})[name] = {"command": _command(name, part, settings, path), "needs": needs}
+        tracks.append(Track(case.name, label, path))
+    return runs, tracks
+
+
 def _command(name: str, case: Case, settings: Settings, events: Path) -> str:
     """The shell command of one stage."""
     pipeline = settings.pipeline
     command = [sys.executable, "-m", "shared.contract.launch", str(pipeline.root), pipeline.package, name,
                "--subject", str(case.subject.folder), "--pipeline", str(pipeline.path), "--events", str(events)]
+    if case.clip:
+        command += ["--clip", case.clip]
     if settings.out:
         command += ["--out", os.path.abspath(settings.out)]
     return shlex.join([*command, *settings.arguments[name]])

@@ -36,9 +36,25 @@ class Flag:
 
 
 def reprojection_px(run: RunFolder) -> float | None:
-    """Median distance of the tracked skin points from where the solved poses put them, px of the crop."""
-    record = read_record(run.published("track_landmarks") / "tracking.json") or {}
-    return _number(record.get("reprojection_px", {}), "median")
+    """Median distance of the tracked skin points from where the solved poses put them, px of the crop; of several
+    clips the largest."""
+    return max((error for error, _ in tracking_errors(run)), default=None)
+
+
+def tracking_errors(run: RunFolder) -> list[tuple[float, RunFolder]]:
+    """reprojection_px of each clip, with its folder, where it is known."""
+    found = []
+    for clip in clips_of(run):
+        record = read_record(clip.published("track_landmarks") / "tracking.json") or {}
+        error = _number(record.get("reprojection_px", {}), "median")
+        found += [] if error is None else [(error, clip)]
+    return found
+
+
+def clips_of(run: RunFolder) -> list[RunFolder]:
+    """The folders of the clips that the result was solved from, in order; the run itself where there is but one."""
+    solved = read_record(run.published("inverse_render") / "solve.json") or {}
+    return [run.of_clip(clip["name"]) for clip in solved.get("clips", ())] or [run]
 
 
 def held_out_residual(run: RunFolder) -> float | None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from shared.contract.folders import RunFolder
+from shared.contract.folders import CLIPS, RunFolder
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
 from tools.cases import Case
@@ -21,7 +22,8 @@ def removable(run: RunFolder, pipeline: Pipeline) -> list[Path]:
     paths = [run.work / name for name in names] + [run.failed(name) for name in names]
     paths += [run.stamp(name) for name in names]
     paths += [run.memory, *(run.work / name for name in ("workflow.log", RECORD, PICTURE))]
-    return [path for path in paths if path.exists()]
+    found = [path for path in paths if path.exists()]
+    return found + [path for clip in run.clips() for path in removable(clip, pipeline)]
 
 
 def clean(run: RunFolder, pipeline: Pipeline, dry_run: bool) -> Iterator[str]:
@@ -32,13 +34,18 @@ def clean(run: RunFolder, pipeline: Pipeline, dry_run: bool) -> Iterator[str]:
     total = 0
     with run.locked("run"):
         if not dry_run:
-            clear_leftovers(run, pipeline)
+            for own in (run, *run.clips()):
+                clear_leftovers(own, pipeline)
         for path in removable(run, pipeline):
             size = folder_size(path) if path.is_dir() else path.stat().st_size
             total += size
             yield f"{'would remove' if dry_run else 'remove'} {path} ({readable_size(size)})"
             if not dry_run:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
+        for folder in [folder for clip in run.clips() for folder in (clip.work, clip.root)] + [run.work / CLIPS]:
+            with contextlib.suppress(OSError):  # not empty, or never there
+                if not dry_run:
+                    folder.rmdir()
     yield f"{run.work}: {readable_size(total)} {'to free' if dry_run else 'freed'}; export/ is kept"
 
 

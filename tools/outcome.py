@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from shared.contract.disk import FULL_BELOW_BYTES, free_bytes
-from shared.contract.folders import RunFolder
 from shared.contract.manifest import LOG, PROVENANCE, read_record, write_record
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
@@ -59,7 +58,7 @@ def at_fault(folder: Path, error: InputError) -> Outcome:
 def outcome_of(case: Case, pipeline: Pipeline, plans: Mapping[str, StagePlan], tracks: Sequence[Track] = (),
                interrupted: bool = False, engine_log: Path | None = None) -> Outcome:
     """What the plan after the run and the events of its stages say."""
-    costs = costs_of(case.run, pipeline)
+    costs = costs_of(case, pipeline)
     facts = {"subject": case.name, "folder": str(case.subject.folder), "results": str(case.run.root), **costs}
     left = [name for name, plan in plans.items() if plan.state != CURRENT]
     if not left:
@@ -74,7 +73,7 @@ def outcome_of(case: Case, pipeline: Pipeline, plans: Mapping[str, StagePlan], t
         if track := by_state.get(state):
             return Outcome(state=state, stage=track.stage, reason=track.message, log=track.log, **facts)
     if track := by_state.get("running"):
-        log = case.run.failed(track.stage) / LOG
+        log = plans[track.stage].case.run.failed(plans[track.stage].name) / LOG
         return Outcome(state="killed", stage=track.stage, log=str(log) if log.is_file() else "",
                        reason=f"{track.stage} was killed without a message (out of memory?)", **facts)
     if free_bytes(case.run.work) < FULL_BELOW_BYTES:
@@ -84,9 +83,9 @@ def outcome_of(case: Case, pipeline: Pipeline, plans: Mapping[str, StagePlan], t
                    log=str(engine_log) if engine_log and engine_log.is_file() else "", **facts)
 
 
-def costs_of(run: RunFolder, pipeline: Pipeline) -> dict[str, object]:
+def costs_of(case: Case, pipeline: Pipeline) -> dict[str, object]:
     """Minutes in all, highest memory, bytes and warnings of the published stages."""
-    records = [read_record(run.published(name) / PROVENANCE) or {} for name in pipeline.steps]
+    records = [read_record(part.run.published(name) / PROVENANCE) or {} for part, name in case.jobs(pipeline)]
     warnings = [text for record in records for text in record.get("warnings", ())]
     return {"minutes": round(sum(record.get("wall_s", 0.0) for record in records) / 60, 2),
             "memory_mb": max((record.get("peak_memory_mb", 0.0) for record in records), default=0.0),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from shared.contract.declare import Stage
 from shared.contract.hashing import HashMemory
@@ -27,21 +27,23 @@ _SHOWN_FILES = 3
 
 @dataclass(frozen=True)
 class StagePlan:
-    """state: CURRENT; RUNS; WAITS, which means that it depends on what earlier stages will write."""
+    """state: CURRENT; RUNS; WAITS, which means that it depends on what earlier stages will write. case: whose stage."""
 
     name: str
     state: str
     reasons: tuple[str, ...] = ()
     digest: str | None = field(default=None, repr=False)
+    case: Case | None = field(default=None, repr=False)
 
 
 def plan_case(pipeline: Pipeline, case: Case, parameters: Mapping[str, Mapping[str, object]],
               verify: bool = False) -> dict[str, StagePlan]:
-    """{stage: plan} in the pipeline's order. verify: read every published file again."""
+    """{label of the stage: plan} in the pipeline's order. verify: read every published file again."""
     memory = HashMemory(case.run.memory, verify)
     plans: dict[str, StagePlan] = {}
-    for name, stage in pipeline.stages.items():
-        plans[name] = _plan_stage(stage, case, parameters[name], plans, memory)
+    for part, name in case.jobs(pipeline):
+        plan = _plan_stage(pipeline.stages[name], part, parameters[name], plans, memory)
+        plans[part.label(name)] = replace(plan, case=part)
     memory.save()
     return plans
 
@@ -54,11 +56,12 @@ def _plan_stage(stage: Stage, case: Case, parameters: Mapping[str, object], plan
         reason = "its manifest is missing or damaged" if folder.is_dir() else "never ran"
         return StagePlan(stage.name, RUNS, (reason,))
     inputs = source_inputs(stage, case.subject, memory) | file_inputs(stage, parameters, memory)
-    inputs |= {name: plans[name].digest for name in stage.inputs}
+    needed = {name: case.label(name) for name in case.inputs(stage)}
+    inputs |= {name: plans[label].digest for name, label in needed.items()}
     reasons = make_work(stage, parameters, inputs).reasons(manifest) or damage(folder, manifest, memory)
     if reasons:
         return StagePlan(stage.name, RUNS, tuple(reasons))
-    waiting = [name for name in stage.inputs if plans[name].state != CURRENT]
+    waiting = [label for label in needed.values() if plans[label].state != CURRENT]
     if waiting:
         return StagePlan(stage.name, WAITS, (f"if the outputs of {', '.join(waiting)} change",))
     return StagePlan(stage.name, CURRENT, _drift(case, stage), outputs_digest(manifest))
@@ -93,6 +96,6 @@ def plan_lines(case: Case, plans: Mapping[str, StagePlan]) -> list[str]:
     """The plan for people."""
     width = max(map(len, plans))
     lines = [f"{case.name}: {case.run.root}"]
-    for plan in plans.values():
-        lines.append(f"  {plan.name:{width}}  {plan.state:8}  {'; '.join(plan.reasons)}".rstrip())
+    for label, plan in plans.items():
+        lines.append(f"  {label:{width}}  {plan.state:8}  {'; '.join(plan.reasons)}".rstrip())
     return lines

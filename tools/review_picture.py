@@ -13,7 +13,7 @@ from shared.io.frames import FrameSet
 from shared.io.images import read_exr, read_png, write_png
 from shared.report.gather import compared_frames
 from shared.report.pictures import error_bytes, srgb_bytes, viridis_bytes
-from tools.gates import PICTURE, confidence_map
+from tools.gates import PICTURE, clips_of, confidence_map, tracking_errors
 
 WIDTH_PX, TITLE_PX, TILE_PX = 960, 36, 320
 _TEXT = (235, 235, 235)
@@ -28,15 +28,16 @@ def write_review(run: RunFolder, gates: Sequence[str], titles: Sequence[str]) ->
 
 
 def _residuals(run: RunFolder) -> np.ndarray:
-    """Where on the skin the tracks do not fit."""
-    return read_png(run.published("track_landmarks") / "residuals.png")
+    """Where on the skin the tracks do not fit, of the clip that was tracked worst."""
+    clip = max(tracking_errors(run), key=lambda pair: pair[0])[1]
+    return read_png(clip.published("track_landmarks") / "residuals.png")
 
 
 def _worst_frames(run: RunFolder) -> np.ndarray:
     """Clip, re-render and error of the three re-rendered frames that fit worst."""
     solved = run.published("inverse_render")
     record = read_json(solved / "solve.json")
-    frames = FrameSet.open(run.published("sample_frames"))
+    frames = FrameSet.open(clips_of(run)[0].published("sample_frames"))
     compared = compared_frames(frames, solved / "renders", record["render_frames"], record["held_out_frames"])
     rows = []
     for frame in compared:

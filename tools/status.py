@@ -21,9 +21,9 @@ def status_of(case: Case, plans: Mapping[str, StagePlan]) -> dict[str, object]:
     live = {track.stage: track for track in running_stages(case)}
     stages = []
     for name, plan in plans.items():
-        folder, track = case.run.published(name), live.get(name)
+        folder, track = plan.case.run.published(plan.name), live.get(name)
         provenance = read_record(folder / PROVENANCE) or {}
-        failed = case.run.failed(name) / "log.txt"
+        failed = plan.case.run.failed(plan.name) / "log.txt"
         stages.append({
             "stage": name, "state": "running" if track else plan.state, "reasons": list(plan.reasons),
             "bytes": folder_size(folder) if folder.is_dir() else None, "seconds": provenance.get("wall_s"),
@@ -43,8 +43,9 @@ def running_stages(case: Case) -> Iterator[Track]:
     """The stages at work, as their events tell; none where no living process holds the subject."""
     if not case.run.is_locked("run"):
         return
-    for path in sorted(case.run.work.glob(f"{SCRATCH}*/{EVENTS}/*.jsonl")):
-        track = Track(case.name, path.stem, path)
+    for path in sorted(case.run.work.glob(f"{SCRATCH}*/{EVENTS}/**/*.jsonl")):
+        within = path.relative_to(case.run.work).parts[2:]
+        track = Track(case.name, "/".join(within).removesuffix(".jsonl"), path)
         for event in track.new_events():
             track.apply(event)
         if track.state == "running":

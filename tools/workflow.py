@@ -73,17 +73,23 @@ def _begin(stack: contextlib.ExitStack, case: Case, settings: Settings) -> dict[
     with contextlib.ExitStack() as own:
         own.enter_context(case.run.locked("run"))
         try:
-            clear_leftovers(case.run, settings.pipeline)
+            clear_all_leftovers(case, settings.pipeline)
             for path in case.run.work.glob(f"{SCRATCH}*"):
                 shutil.rmtree(path, ignore_errors=True)
             plan = plan_case(settings.pipeline, case, settings.parameters)
-            _renew_stamps(case.run, plan)
+            _renew_stamps(plan)
         except OSError as error:
             raise InputError("cannot be read or written", where=str(error.filename or case.run.root),
                              got=error.strerror, mend="check permissions and disk, or write elsewhere with --out DIR"
                              ) from error
         stack.push(own.pop_all())
     return plan
+
+
+def clear_all_leftovers(case: Case, pipeline: Pipeline, keep_logs: bool = True) -> None:
+    """The same for the subject's folder and for those of its clips."""
+    for run in dict.fromkeys(part.run for part, _ in case.jobs(pipeline)):
+        clear_leftovers(run, pipeline, keep_logs)
 
 
 def clear_leftovers(run: RunFolder, pipeline: Pipeline, keep_logs: bool = True) -> None:
@@ -101,13 +107,13 @@ def clear_leftovers(run: RunFolder, pipeline: Pipeline, keep_logs: bool = True) 
             run.remove_leftovers(name)
 
 
-def _renew_stamps(run: RunFolder, plans: Mapping[str, StagePlan]) -> None:
+def _renew_stamps(plans: Mapping[str, StagePlan]) -> None:
     """Stamps of current stages are written, all others removed: Snakemake then does just what the plan says."""
     for plan in plans.values():
         if plan.state == CURRENT:
-            run.write_stamp(plan.name)
+            plan.case.run.write_stamp(plan.name)
         else:
-            run.stamp(plan.name).unlink(missing_ok=True)
+            plan.case.run.stamp(plan.name).unlink(missing_ok=True)
 
 
 def is_current(plans: Mapping[str, StagePlan]) -> bool:
@@ -126,7 +132,7 @@ def _run_waiting(cases: Sequence[Case], settings: Settings, start: float) -> dic
         finally:
             watch.close()
         for case in cases:
-            clear_leftovers(case.run, settings.pipeline, keep_logs=not interrupted)
+            clear_all_leftovers(case, settings.pipeline, keep_logs=not interrupted)
         if not interrupted and all(track.state == "waiting" for track in watch.tracks):
             for line in log.read_text(encoding="utf-8", errors="replace").splitlines()[-20:]:
                 _say(f"| {line}")
@@ -139,7 +145,8 @@ def _conclude(case: Case, tracks: Sequence[Track], settings: Settings, log: Path
     """Keeps the engine's log and says how the subject's run ended."""
     plans = plan_case(settings.pipeline, case, settings.parameters)
     kept = case.run.work / _WORKFLOW_LOG
-    if any(case.run.published(name).exists() or case.run.failed(name).exists() for name in plans):
+    folders = [(plan.case.run.published(plan.name), plan.case.run.failed(plan.name)) for plan in plans.values()]
+    if any(published.exists() or failed.exists() for published, failed in folders):
         with contextlib.suppress(OSError):
             shutil.copyfile(log, kept)
     outcome = outcome_of(case, settings.pipeline, plans, tracks, interrupted, kept)

@@ -101,6 +101,7 @@ def make_parser(stage: Stage) -> argparse.ArgumentParser:
     parser = _OneLineParser(prog=f"python -m stages.{stage.name}", description=stage.help,
                             epilog="parameters:\n" + "\n".join(lines), formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--subject", type=Path, required=True, metavar="DIR", help="folder with subject.yaml")
+    parser.add_argument("--clip", metavar="NAME", help="which clip, where subject.yaml names several")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write to DIR/<subject>/, not to the subject's folder")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a parameter; may be repeated")
     parser.add_argument("--preset", help="preset of pipeline.yaml (its default_preset)")
@@ -125,8 +126,22 @@ def parse_request(stage: Stage, argv: Sequence[str] | None) -> Request:
     if threads < 1:
         raise InputError("number of threads not allowed", where="--threads", got=threads, expected=">= 1")
     run = RunFolder.of(subject.folder, subject.name, args.out)
+    if subject.clips or args.clip is not None:
+        subject, run = _part(stage, subject, run, args.clip, bool(stage.joins) or stage.name in pipeline.joint)
     disk_mb = _disk_needed(pipeline, stage, args.preset, run)
     return Request(stage, subject, run, parameters, threads, args.force, args.verify, args.events, disk_mb)
+
+
+def _part(stage: Stage, subject: Subject, run: RunFolder, clip: str | None, joint: bool) -> tuple[Subject, RunFolder]:
+    """What of a subject with several clips the stage works on: all of it, or the one clip that is named."""
+    if joint:
+        if clip is not None:
+            raise InputError("works on all clips together", where=f"{stage.name} --clip", mend="leave --clip out")
+        return subject, run
+    if clip is None:
+        raise InputError("works on one clip at a time", where=stage.name, got=f"{len(subject.clips)} clips",
+                         mend=f"add --clip NAME, one of {', '.join(clip.name for clip in subject.clips)}")
+    return subject.clip(clip, "--clip"), run.of_clip(clip)
 
 
 def _disk_needed(pipeline: Pipeline, stage: Stage, preset: str | None, run: RunFolder) -> float | None:

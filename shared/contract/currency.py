@@ -24,8 +24,7 @@ def input_hashes(stage: Stage, subject: Subject, run: RunFolder, parameters: Map
                  memory: HashMemory) -> dict[str, str]:
     """{name: SHA-256} of all that the stage reads; InputError where an input stage has no sound result."""
     inputs = source_inputs(stage, subject, memory) | file_inputs(stage, parameters, memory)
-    for name in stage.inputs:
-        folder = run.published(name)
+    for name, folder in run.inputs(stage, [clip.name for clip in subject.clips]).items():
         manifest = read_manifest(folder)
         faults = ["has no result yet"] if manifest is None else damage(folder, manifest, memory)
         if faults:

@@ -135,7 +135,8 @@ class Stage:
 
     inputs: stages whose folders are read. A stage without inputs reads the subject's video. given: files of the subject
     that are read where subject.yaml names them. A stage named export_* publishes to `export/`, all others to
-    `work/<name>/`.
+    `work/<name>/`. joins: inputs of which the stage reads every clip's, where a subject has several clips; a stage
+    that joins nothing then runs for each clip by itself.
     """
 
     name: str
@@ -145,6 +146,7 @@ class Stage:
     outputs: tuple[Output, ...]
     parameters: tuple[Parameter, ...] = ()
     given: tuple[str, ...] = ()
+    joins: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "inputs", tuple(self.inputs))
@@ -154,6 +156,8 @@ class Stage:
             parameters += (SEED,)
         object.__setattr__(self, "parameters", parameters)
         names = [p.name for p in parameters]
+        if not set(self.joins) <= set(self.inputs):
+            raise ValueError(f"stage {self.name!r} joins what is not among its inputs")
         if not _NAME.match(self.name) or not self.help or not self.outputs or len(set(names)) != len(names):
             raise ValueError(f"stage {self.name!r} needs a snake_case name, a sentence, outputs, unique parameters")
 

@@ -72,7 +72,7 @@ def _do(request: Request, work: Work, run: Callable[[Job], None], check: Callabl
         temporary: Path, reporter: Reporter, memory: HashMemory) -> float:
     """Runs, checks, publishes; returns the wall seconds."""
     stage, folders = request.stage, request.run
-    inputs = {name: folders.published(name) for name in stage.inputs}
+    inputs = folders.inputs(stage, [clip.name for clip in request.subject.clips])
     job = Job(stage, request.subject, request.parameters, temporary, folders, inputs, reporter, request.threads)
     meter = Meter()
     try:

@@ -8,13 +8,15 @@ import fcntl
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from shared.contract.confine import check_results
-from shared.contract.declare import folder_of
+from shared.contract.declare import Stage, folder_of
 from shared.contract.manifest import LOG, outputs_digest, read_manifest
 from shared.errors import InputError
+
+CLIPS = "clips"
 
 
 class RunFolder:
@@ -30,6 +32,17 @@ class RunFolder:
         run = cls(Path(os.path.abspath(out)) / name if out else folder)
         check_results(run.root, run.work)
         return run
+
+    def of_clip(self, name: str) -> RunFolder:
+        """The folder of one clip's own stages, where a subject has several clips; laid out as that of a subject."""
+        clip = RunFolder(self.work / CLIPS / name)
+        check_results(self.work / CLIPS, self.work / CLIPS)
+        check_results(clip.root, clip.work)
+        return clip
+
+    def clips(self) -> list[RunFolder]:
+        """The folders of all clips that ever ran."""
+        return [RunFolder(path) for path in sorted((self.work / CLIPS).glob("*"))]
 
     def published(self, name: str) -> Path:
         """The stage's folder."""
@@ -68,6 +81,16 @@ class RunFolder:
         temporary.rename(target)
         shutil.rmtree(old, ignore_errors=True)
         shutil.rmtree(self.failed(name), ignore_errors=True)
+
+    def inputs(self, stage: Stage, clips: Sequence[str]) -> dict[str, Path]:
+        """{name: folder} of a stage's inputs; of those that it joins one of each clip, as clip/name."""
+        folders = {}
+        for name in stage.inputs:
+            if clips and name in stage.joins:
+                folders |= {f"{clip}/{name}": self.of_clip(clip).published(name) for clip in clips}
+            else:
+                folders[name] = self.published(name)
+        return folders
 
     def write_stamp(self, name: str) -> None:
         """Writes the stamp of the published folder."""

@@ -36,30 +36,38 @@ class Parameters:
 class Job:
     """One run of one stage.
 
-    subject: facts of subject.yaml. params: the stage's parameters, `seed` included. out: the folder to write into; it
-    is published when run and check have returned. threads: cores the stage may use.
+    subject: facts of subject.yaml; of several clips, of the one that this run is about, or of all. params: the stage's
+    parameters, `seed` included. out: the folder to write into; it is published when run and check have returned.
+    threads: cores the stage may use.
     """
 
     def __init__(self, stage: Stage, subject: Subject, params: Mapping[str, object], out: Path, run: RunFolder,
                  folders: Mapping[str, Path], reporter: Reporter, threads: int) -> None:
-        """folders: {stage: published folder} of the declared inputs."""
+        """folders: {stage: published folder} of the declared inputs, or {clip/stage: ...}."""
         self.stage, self.subject, self.params, self.out = stage, subject, Parameters(params), out
         self.threads = threads
         self._run, self._folders, self._reporter = run, dict(folders), reporter
 
-    def input(self, stage: str) -> Path:
-        """The published folder of a declared input."""
-        if stage not in self._folders:
-            raise LimnError(f"{self.stage.name} does not declare the input {stage!r}")
-        return self._folders[stage]
+    @property
+    def clips(self) -> tuple[str, ...]:
+        """Names of the clips that the stage joins; empty where there is but one."""
+        return tuple(clip.name for clip in self.subject.clips)
 
-    def manifest(self, stage: str) -> dict:
+    def input(self, stage: str, clip: str = "") -> Path:
+        """The published folder of a declared input; clip: of which clip, the first one's by default."""
+        of_clip = f"{clip or next(iter(self.clips), '')}/{stage}"
+        for name in (stage, of_clip):
+            if name in self._folders:
+                return self._folders[name]
+        raise LimnError(f"{self.stage.name} does not declare the input {stage!r}")
+
+    def manifest(self, stage: str, clip: str = "") -> dict:
         """manifest.json of a declared input."""
-        return _present(read_manifest(self.input(stage)), self.input(stage))
+        return _present(read_manifest(self.input(stage, clip)), self.input(stage, clip))
 
-    def provenance(self, stage: str) -> dict:
+    def provenance(self, stage: str, clip: str = "") -> dict:
         """provenance.json of a declared input. For volatile outputs only: it is no part of the stage's key."""
-        return _present(read_record(self.input(stage) / PROVENANCE), self.input(stage))
+        return _present(read_record(self.input(stage, clip) / PROVENANCE), self.input(stage, clip))
 
     def progress(self, iterable: Iterable[Item], label: str, total: int | None = None) -> Iterator[Item]:
         """The items, with a bar on a terminal and plain lines elsewhere."""

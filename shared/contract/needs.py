@@ -88,11 +88,13 @@ def amount(needs: Mapping[str, Mapping[str, float]], kind: str, scale: Scale) ->
 def measured_scale(run: Path, expected: Scale) -> Scale:
     """The scale of the clip as sample_frames found it, or the expected one as long as it has not run.
 
-    run: the folder that holds work/.
+    run: the folder that holds work/. Of several clips all frames, and the largest crop.
     """
+    record = Path("sample_frames") / "frames.json"
+    paths = sorted((run / "work" / "clips").glob(f"*/work/{record}")) or [run / "work" / record]
     try:
-        content = json.loads((run / "work" / "sample_frames" / "frames.json").read_text(encoding="utf-8"))
-        width, height = map(float, content["size"])
-        return Scale(len(content["frames"]), (width * height) ** 0.5, expected.map_px)
+        contents = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+        areas = [float(width) * float(height) for width, height in (content["size"] for content in contents)]
+        return Scale(sum(len(content["frames"]) for content in contents), max(areas) ** 0.5, expected.map_px)
     except (OSError, ValueError, KeyError, TypeError):
         return expected

@@ -13,7 +13,7 @@ from shared.contract.confine import is_trusted
 from shared.contract.declare import Parameter, Stage
 from shared.contract.needs import parse_needs, parse_sizes
 from shared.contract.source import read_declaration
-from shared.contract.wording import check_keys, nearest, read_yaml, unknown_name
+from shared.contract.wording import Anything, check_keys, nearest, read_yaml, unknown_name
 from shared.errors import InputError, shown
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -95,6 +95,19 @@ class Pipeline:
             raise InputError("more than one stage publishes to export/", where=str(self.path))
         return declared
 
+    @cached_property
+    def joint(self) -> frozenset[str]:
+        """The stages that work on all clips of a subject together; all others run for each clip by itself."""
+        joint: set[str] = set()
+        for name, stage in self.stages.items():
+            if stage.joins or joint & set(stage.inputs):
+                joint.add(name)
+                each = [need for need in stage.inputs if need not in joint]
+                if set(each) != set(stage.joins):
+                    raise InputError("joins other inputs than those that run for each clip", got=list(stage.joins),
+                                     where=str(self.stage_file(name)), expected=each)
+        return frozenset(joint)
+
     def stage_file(self, name: str) -> Path:
         """The stage's source file."""
         return self.root.joinpath(*self.package.split("."), f"{name}.py")
@@ -132,7 +145,7 @@ def load_pipeline(path: Path | None = None) -> Pipeline:
         raise InputError("no such file", where=str(path), mend="give the pipeline with --pipeline FILE")
     known = ("package", "stages", "presets", "default_preset", "sizes", "gates")
     content = check_keys(read_yaml(path), known, str(path))
-    given = check_keys(content.get("stages"), _Anything(), f"{path}: stages")
+    given = check_keys(content.get("stages"), Anything(), f"{path}: stages")
     for name in given:
         if not _is_name(name):
             raise InputError("not a stage's name", where=f"{path}: stages", got=shown(name), expected="snake_case")
@@ -140,7 +153,7 @@ def load_pipeline(path: Path | None = None) -> Pipeline:
     if not steps:
         raise InputError("no stages", where=str(path))
     steps = _in_order(steps, path)
-    presets = check_keys(content.get("presets"), _Anything(), f"{path}: presets")
+    presets = check_keys(content.get("presets"), Anything(), f"{path}: presets")
     presets = {str(name): _preset(value, steps, f"{path}: presets.{shown(name)}") for name, value in presets.items()}
     default, package = content.get("default_preset", "standard"), content.get("package", "stages")
     for key, value in (("default_preset", default), ("package", package)):
@@ -151,7 +164,7 @@ def load_pipeline(path: Path | None = None) -> Pipeline:
     presets = presets or {default: {}}
     if default not in presets:
         raise unknown_name("preset", default, presets, f"{path}: default_preset")
-    gates = check_keys(content.get("gates"), _Anything(), f"{path}: gates")
+    gates = check_keys(content.get("gates"), Anything(), f"{path}: gates")
     gates = {str(name): _gate(value, f"{path}: gates.{shown(name)}") for name, value in gates.items()}
     return Pipeline(path, package, steps, presets, default, parse_sizes(content.get("sizes"), f"{path}: sizes"), gates)
 
@@ -168,13 +181,6 @@ def _is_name(value: object) -> bool:
     return isinstance(value, str) and _NAME.match(value) is not None
 
 
-class _Anything:
-    """A collection that holds every key: for mappings whose keys are names that the file itself gives."""
-
-    def __contains__(self, key: object) -> bool:
-        return True
-
-
 def _step(value: object, where: str) -> Step:
     given = check_keys(value, ("needs", "threads", "resources", "parameters"), where)
     needs = given.get("needs") or []
@@ -182,7 +188,7 @@ def _step(value: object, where: str) -> Step:
         raise InputError("not a list of stages", where=f"{where}.needs", got=shown(needs))
     booked = parse_needs(given.get("resources"), f"{where}.resources")
     threads = _THREADS.parse(given.get("threads"), f"{where}.threads")
-    parameters = check_keys(given.get("parameters"), _Anything(), f"{where}.parameters")
+    parameters = check_keys(given.get("parameters"), Anything(), f"{where}.parameters")
     return Step(tuple(map(str, needs)), threads, booked, parameters)
 
 
@@ -200,11 +206,11 @@ def _in_order(steps: Mapping[str, Step], path: Path) -> dict[str, Step]:
 
 
 def _preset(value: object, steps: Mapping[str, Step], where: str) -> dict[str, Mapping[str, object]]:
-    given = check_keys(value, _Anything(), where)
+    given = check_keys(value, Anything(), where)
     for name in given:
         if name not in steps:
             raise unknown_name("stage", name, steps, where)
-    return {name: check_keys(settings, _Anything(), f"{where}.{name}") for name, settings in given.items()}
+    return {name: check_keys(settings, Anything(), f"{where}.{name}") for name, settings in given.items()}
 
 
 def split_settings(settings: Iterable[str], stages: Iterable[str], where: str = "--set") -> dict[str, dict[str, str]]:

@@ -1,21 +1,22 @@
-"""A subject: the folder with the clip and subject.yaml."""
+"""A subject: the folder with the clip, or several of one head, and subject.yaml."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from shared.contract.chart_place import AUTO, ChartPlace, parse_chart
 from shared.contract.confine import check_link, inside
 from shared.contract.declare import Parameter
-from shared.contract.wording import check_keys, nearest, read_yaml
+from shared.contract.wording import Anything, check_keys, nearest, read_yaml, unknown_name
 from shared.errors import InputError, shown
 
 TRANSFERS = ("srgb", "bt709", "linear")
 MOVES = ("head", "camera")
 GIVEN = ("landmarks", "poses")
 """Files that a user may bring from another tracker."""
+MOST_CLIPS = 8
 LARGEST_BYTES = 1 << 36
 MOST_FILES = 100_000
 
@@ -25,6 +26,8 @@ _CAMERA = (
     Parameter("sensor_width_mm", float, None, "Width of the sensor's used part.", "mm", 1.0, 500.0),
     Parameter("focal_length_px", float, None, "Focal length in pixels of the source frame.", "px", 10.0, 1e6),
 )
+_CLIP_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}\Z")
+_OF_A_CLIP, _OF_ALL = ("video", "camera", "colour", "tracking", "chart"), ("clips", "capture")
 _NEW = "make a subject with: limn new CLIP"
 
 
@@ -33,7 +36,9 @@ class Subject:
     """Facts of subject.yaml. video: absolute path of the file, or of an image sequence with a counter (%05d).
 
     focal_length_px: of the source frame; None with focal_length_mm also None means: estimate it. landmarks, poses:
-    files of another tracker; hold_poses: whether its poses stay as they are. chart: where a colour chart is.
+    files of another tracker; hold_poses: whether its poses stay as they are. chart: where a colour chart is. clips: of
+    several clips of one head under different lights each as a subject of its own, named as in subject.yaml; all else is
+    the first one's then.
     """
 
     folder: Path
@@ -48,11 +53,22 @@ class Subject:
     poses: Path | None = None
     hold_poses: bool = False
     chart: ChartPlace = AUTO
+    clips: tuple[Subject, ...] = ()
 
     def content(self) -> dict[str, object]:
         """All that every stage depends on, independent of where the folder lies."""
         keys = ("focal_length_px", "focal_length_mm", "sensor_width_mm", "transfer", "moves")
-        return {key: getattr(self, key) for key in keys}
+        own: dict[str, object] = {key: getattr(self, key) for key in keys}
+        return own | {"clips": [[clip.name, clip.content()] for clip in self.clips]} if self.clips else own
+
+    def clip(self, name: str, where: str) -> Subject:
+        """The clip of that name; InputError where there is none. where: what names it."""
+        for clip in self.clips:
+            if clip.name == name:
+                return clip
+        if not self.clips:
+            raise InputError("this subject has one clip", where=where, got=name, mend="leave the name out")
+        raise unknown_name("clip", name, [clip.name for clip in self.clips], where)
 
     def video_name(self) -> str:
         """The video's path inside the folder."""
@@ -100,23 +116,53 @@ def _load(folder: Path) -> Subject:
         raise InputError("the folder's name cannot be used", where=str(folder), expected="printable letters in UTF-8",
                          mend="rename it")
     check_link(path, folder)
-    content = check_keys(read_yaml(path), ("video", "camera", "colour", "capture", "tracking", "chart"), str(path))
-    camera = _camera(check_keys(content.get("camera"), [p.name for p in _CAMERA], f"{path}: camera"), path)
-    colour = check_keys(content.get("colour"), ("transfer",), f"{path}: colour")
+    content = check_keys(read_yaml(path), (*_OF_A_CLIP, *_OF_ALL), str(path))
     capture = check_keys(content.get("capture"), ("moves",), f"{path}: capture")
-    video = _video(folder, content.get("video"), path)
-    transfer = _choice(colour.get("transfer", "srgb"), TRANSFERS, f"{path}: colour.transfer")
     moves = _choice(capture.get("moves", "head"), MOVES, f"{path}: capture.moves")
-    given = _tracking(folder, content.get("tracking"), f"{path}: tracking")
-    chart = parse_chart(content.get("chart"), f"{path}: chart")
+    if content.get("clips") is None:
+        return _clip(folder, name, content, moves, f"{path}: ")
+    clips = tuple(_clip(folder, key, given, moves, f"{path}: clips.{key}.") for key, given in _clips(content, path))
+    videos = [clip.video for clip in clips]
+    for clip in clips:
+        if videos.count(clip.video) > 1:
+            raise InputError("two clips of one video", where=f"{path}: clips.{clip.name}.video", got=clip.video_name(),
+                             mend="give each clip a video of its own")
+    return replace(clips[0], name=name, clips=clips)
+
+
+def _clips(content: dict, path: Path) -> list[tuple[str, dict]]:
+    """Names and settings of the clips; what they leave out of camera and colour the whole subject says."""
+    where = f"{path}: clips"
+    for key in ("video", "tracking", "chart"):
+        if content.get(key) is not None:
+            raise InputError(f"both {key} and clips", where=str(path),
+                             mend=f"move {key} to where it belongs: clips: {{NAME: {{{key}: ...}}}}")
+    named = check_keys(content["clips"], Anything(), where)
+    for name in named:
+        if not isinstance(name, str) or not _CLIP_NAME.match(name):
+            raise InputError("not a clip's name", where=where, got=shown(name), expected="a short name in snake_case")
+    if not 2 <= len(named) <= MOST_CLIPS:
+        raise InputError("number of clips not allowed", where=where, got=len(named), expected=f"2 .. {MOST_CLIPS}",
+                         mend="name one clip as video: FILE, without clips")
+    common = {key: content[key] for key in ("camera", "colour") if content.get(key) is not None}
+    return [(name, common | check_keys(own, _OF_A_CLIP, f"{where}.{name}")) for name, own in named.items()]
+
+
+def _clip(folder: Path, name: str, content: dict, moves: str, where: str) -> Subject:
+    """One clip with all that is known of it. where: what stands before the keys in messages."""
+    camera = _camera(check_keys(content.get("camera"), [p.name for p in _CAMERA], f"{where}camera"), f"{where}camera")
+    colour = check_keys(content.get("colour"), ("transfer",), f"{where}colour")
+    video = _video(folder, content.get("video"), f"{where}video")
+    transfer = _choice(colour.get("transfer", "srgb"), TRANSFERS, f"{where}colour.transfer")
+    given = _tracking(folder, content.get("tracking"), f"{where}tracking")
+    chart = parse_chart(content.get("chart"), f"{where}chart")
     subject = Subject(folder, name, video, transfer=transfer, moves=moves, chart=chart, **camera, **given)
     _check_files(subject)
     return subject
 
 
-def _camera(given: dict, path: Path) -> dict[str, float | None]:
-    camera = {p.name: p.parse(given.get(p.name), f"{path}: camera.{p.name}") for p in _CAMERA}
-    where = f"{path}: camera"
+def _camera(given: dict, where: str) -> dict[str, float | None]:
+    camera = {p.name: p.parse(given.get(p.name), f"{where}.{p.name}") for p in _CAMERA}
     if camera["focal_length_px"] is not None and camera["focal_length_mm"] is not None:
         raise InputError("both focal_length_px and focal_length_mm", where=where, mend="keep one of them")
     if camera["focal_length_mm"] is not None and camera["sensor_width_mm"] is None:
@@ -148,9 +194,8 @@ def _tracking(folder: Path, given: object, where: str) -> dict[str, object]:
     return {**files, "hold_poses": hold}
 
 
-def _video(folder: Path, value: object, path: Path) -> Path:
+def _video(folder: Path, value: object, where: str) -> Path:
     """The video's absolute path; an image sequence has one counter, in the file's name."""
-    where = f"{path}: video"
     if not isinstance(value, str) or not value.strip():
         raise InputError("no video named", where=where, expected="a file in the subject's folder, e.g. clip.mp4")
     file = inside(folder, value, where)

@@ -38,6 +38,13 @@ def check_keys(mapping: object, known: Collection[str], where: str) -> dict:
     return mapping
 
 
+class Anything:
+    """A collection that holds every key: for mappings whose keys are names that the file itself gives."""
+
+    def __contains__(self, key: object) -> bool:
+        return True
+
+
 class _StrictLoader(yaml.SafeLoader):
     """Safe YAML in which a key that is given twice is an error instead of the last one winning.
 

@@ -1,4 +1,4 @@
-"""Text and bars on one page."""
+"""Text and bars on one page, of several clips one below the other."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ STAGE = Stage(
     version=1,
     help="Writes the page.",
     inputs=("read_text", "draw_bars"),
+    joins=("read_text", "draw_bars"),
     outputs=(Output("page.txt", "the page"), Output("report.html", "costs", volatile=True)),
     parameters=(Parameter("title", str, "Words", "Title of the page."),),
 )
@@ -16,8 +17,11 @@ STAGE = Stage(
 
 def run(job: Job) -> None:
     """Writes the page and, as its report, what the bars cost."""
-    text, bars = job.input("read_text") / "text.txt", job.input("draw_bars") / "bars.txt"
-    (job.out / "page.txt").write_text("\n\n".join([job.params.title, text.read_text(), bars.read_text()]))
+    parts = [job.params.title]
+    for clip in job.clips or ("",):
+        text, bars = job.input("read_text", clip) / "text.txt", job.input("draw_bars", clip) / "bars.txt"
+        parts += [clip] * bool(clip) + [text.read_text(), bars.read_text()]
+    (job.out / "page.txt").write_text("\n\n".join(parts))
     seconds, version = job.provenance("draw_bars")["wall_s"], job.manifest("draw_bars")["version"]
     (job.out / "report.html").write_text(f"{seconds} {version}")
 
