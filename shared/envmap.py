@@ -107,6 +107,23 @@ def cube_lookup(directions: np.ndarray, resolution: int) -> sparse.csr_matrix:
     return sparse.coo_matrix((weights.ravel(), entries), shape=shape).tocsr()
 
 
+def frame_lookup(
+    directions: np.ndarray, world_from_head: np.ndarray, resolution: int, light_index: np.ndarray | None = None
+) -> sparse.csr_matrix:
+    """Look-up of a cubemap along head-space directions [J, 3] in F frames: [J * F, 6 n^2], frames running fastest.
+
+    world_from_head [F, 3, 3]; light_index [F]: which of L cubemaps, one below the other, each frame stands in, so that
+    the matrix is [J * F, L * 6 n^2]; None: there is one.
+    """
+    lookup = cube_lookup(np.einsum("fij,dj->dfi", world_from_head, directions).reshape(-1, 3), resolution)
+    if light_index is None:
+        return lookup
+    texels = 6 * resolution**2
+    first = np.repeat(np.tile(light_index, len(directions)) * texels, np.diff(lookup.indptr))
+    shape = (lookup.shape[0], (int(light_index.max()) + 1) * texels)
+    return sparse.csr_matrix((lookup.data, lookup.indices + first, lookup.indptr), shape=shape)
+
+
 def cube_smoothness(resolution: int) -> sparse.csr_matrix:
     """[12 n^2, 6 n^2]: one row per pair of neighbouring texels, +1 and -1, across face borders too."""
     n = resolution

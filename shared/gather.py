@@ -177,13 +177,15 @@ def gather_samples(
 ) -> Samples:
     """Samples of the vertices index [P] in F frames.
 
-    pictures: iterable of F Picture, read once in order; camera_from_head [F, 4, 4]; intrinsics [3, 3] of the pictures.
+    pictures: iterable of F Picture, read once in order; camera_from_head [F, 4, 4]; intrinsics [3, 3] of the pictures,
+    or [F, 3, 3] of each.
     """
     shape = (len(index), len(camera_from_head))
+    intrinsics = np.broadcast_to(intrinsics, (len(camera_from_head), 3, 3))
     colours, limits = np.zeros(shape + (3,), np.float32), np.zeros(shape + (3,), np.int8)
     weight, towards = np.zeros(shape, np.float32), np.zeros(shape + (3,), np.float32)
     for f, picture in enumerate(pictures):
-        view = viewer.view(camera_from_head[f], intrinsics, picture.inside.shape[::-1])
+        view = viewer.view(camera_from_head[f], intrinsics[f], picture.inside.shape[::-1])
         towards[:, f] = view.towards_camera[index]
         seen = np.nonzero(view.weight[index] > 0)[0]
         pixels = view.pixels[index[seen]]

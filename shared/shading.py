@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shared.brdf import hemispherical_albedo
-from shared.envmap import cube_lookup
+from shared.envmap import frame_lookup
 from shared.geometry import camera_centres, vector_from_rotation, world_from_head
 from shared.lobes import LobeTable, specular_reflection
 from shared.mesh import normalised
@@ -51,12 +51,13 @@ class Material:
 
 
 class VertexShading:
-    """E and S of V vertices under one cubemap light in F frames.
+    """E and S of V vertices under a cubemap light in F frames.
 
     index [P]: the vertices that are shaded, out of all, vertices [V, 3]; points, transfer [P]: theirs; node_transfer:
     the nodes'; light [6 n^2, 3]; directions [J, 3]; camera_from_head [F, 4, 4]; moves: "head" or "camera"; bounce:
     count light that bounced; key_step: largest turn between two frames whose reflections are computed, radians; deep:
-    covered share from which on a vertex takes what the nearest one in the open has.
+    covered share from which on a vertex takes what the nearest one in the open has; light_index [F]: which of several
+    lights, one below the other, each frame stands in, frames of one light in a row; None: there is one.
     """
 
     def __init__(
@@ -74,10 +75,11 @@ class VertexShading:
         bounce: bool = True,
         key_step: float = KEY_STEP,
         deep: float = DEEP,
+        light_index: np.ndarray | None = None,
     ):
         self.material, self.directions = material, directions
         self.points, self.transfer = points, transfer
-        self.light_along = light_along(light, directions, world_from_head(camera_from_head, moves))
+        self.light_along = light_along(light, directions, world_from_head(camera_from_head, moves), light_index)
         flat = self.light_along.reshape(len(directions), -1)
         radiosity = _radiosity(node_transfer, material, self.light_along) if bounce else None
         shape = (len(index), len(camera_from_head), 3)
@@ -88,6 +90,8 @@ class VertexShading:
         self.table = LobeTable(points.normals, transfer.visibility(), directions)
         self._centres = camera_centres(camera_from_head)
         self._turn = turned_so_far(camera_from_head)
+        if light_index is not None:  # so that no frame lies between key frames of two lights
+            self._turn += 2.0 * np.pi * light_index
         self._keys = key_frames(self._turn, key_step)
         self._key_reflection: dict[int, np.ndarray] = {}
         self.stand_in = _stand_ins(vertices, index, transfer.blocked, deep)
@@ -96,16 +100,16 @@ class VertexShading:
         """E [V, 3] float32 over pi."""
         return self._irradiance[:, frame].astype(np.float32)[self.stand_in]
 
-    def mean_irradiance(self) -> np.ndarray:
-        """[V, 3] float32: E averaged over the frames."""
-        return self._irradiance.mean(1, dtype=np.float32)[self.stand_in]
+    def mean_irradiance(self, frames: slice | np.ndarray = slice(None)) -> np.ndarray:
+        """[V, 3] float32: E averaged over the frames, or over some of them."""
+        return self._irradiance[:, frames].mean(1, dtype=np.float32)[self.stand_in]
 
-    def mean_slope(self) -> np.ndarray:
+    def mean_slope(self, frames: slice | np.ndarray = slice(None)) -> np.ndarray:
         """[V, 3] float32: by how much the mean irradiance changes per radian that the normal turns, at most.
 
         E = n . W with the irradiance vector W (Arvo 1994), so it is the length of what of W lies in the surface.
         """
-        light = self.light_along.mean(1)
+        light = self.light_along[:, frames].mean(1)
         moments = (light[:, :, None] * self.directions[:, None] * (4.0 / len(self.directions))).astype(np.float32)
         slope = np.empty((len(self.points), light.shape[1]), np.float32)
         for start in range(0, len(slope), _POINTS_PER_BLOCK):
@@ -191,11 +195,15 @@ def key_frames(turn: np.ndarray, step: float) -> np.ndarray:
     return np.unique([*keys, len(turn) - 1])
 
 
-def light_along(light: np.ndarray, directions: np.ndarray, world_from_head: np.ndarray) -> np.ndarray:
-    """Cubemap [6 n^2, C] along head-space directions [J, 3] in F frames -> [J, F, C] float32."""
-    resolution = round((len(light) / 6) ** 0.5)
-    turned = np.einsum("fij,dj->dfi", world_from_head, directions).reshape(-1, 3)
-    values = cube_lookup(turned, resolution) @ np.asarray(light, np.float64)
+def light_along(
+    light: np.ndarray, directions: np.ndarray, world_from_head: np.ndarray, light_index: np.ndarray | None = None
+) -> np.ndarray:
+    """Cubemap [6 n^2, C] along head-space directions [J, 3] in F frames -> [J, F, C] float32; light_index [F]: which of
+    several, one below the other."""
+    lights = 1 if light_index is None else int(light_index.max()) + 1
+    resolution = round((len(light) / 6 / lights) ** 0.5)
+    lookup = frame_lookup(directions, world_from_head, resolution, light_index)
+    values = lookup @ np.asarray(light, np.float64)
     return values.astype(np.float32).reshape(len(directions), len(world_from_head), -1)
 
 

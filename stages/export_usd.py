@@ -24,6 +24,7 @@ STAGE = Stage(
     version=2,
     help="The head as USD, glTF, OBJ and EXR, with a report to judge it by.",
     inputs=("sample_frames", "track_landmarks", "init_albedo", "inverse_render"),
+    joins=("sample_frames", "track_landmarks", "init_albedo"),
     outputs=(
         Output("head.usda", "light, camera and motion; loads the next three", unit="mm", space="world"),
         Output("head_payload.usda", "payload of head.usda: joins the next two"),

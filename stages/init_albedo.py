@@ -92,7 +92,7 @@ def run(job: Job) -> None:
     from shared.raycast import RayScene
     from shared.texels import TexelSurface
 
-    inputs, _, frame_index = read_inputs(job.input("sample_frames"), job.input("track_landmarks"))
+    inputs = read_inputs(job.input("sample_frames"), job.input("track_landmarks"))
     mesh = inputs.mesh
     surface, viewer = TexelSurface(mesh, job.params.size), SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
     mean, weight = average_frames(job, inputs, surface, viewer)
@@ -108,7 +108,7 @@ def run(job: Job) -> None:
     write_exr(job.out / "segment_albedo.exr", surface.dilated(surface.to_image(palette[texel_segment])), **linear)
     write_exr(job.out / "weight.exr", surface.to_image(weight), colour_space="data")
     write_png(job.out / "segments.png", borders_picture(mean_image, surface.to_image(texel_segment, 255)))
-    frames_used = min(len(frame_index), job.params.frames)
+    frames_used = min(len(inputs.frame_index), job.params.frames)
     seen_share = round(float((weight > SEEN_WEIGHT).mean()), 4)
     write_json(job.out / "init.json", {"segments": colours, "frames": frames_used, "seen_share": seen_share})
 

@@ -10,10 +10,15 @@ Method   In head space a surface point's view of the sphere never changes, so vi
          starts from a uniform light and the priors: it needs no start from init_albedo, which is an input for
          comparison only.
          Or (solver=reference) as published: shared/solve/reference.py.
+         Several clips of one head under different lights are solved as one (shared/solve/joint_clips.py): one mesh and
+         one set of maps, a light and poses of each. What lies at the top is the first clip's then, and clips/ holds
+         the rest.
 Fails    poses that match no frame; too little of the face seen; results that are not finite.
 """
 
 from __future__ import annotations
+
+from pathlib import Path
 
 from shared.contract import Job, Output, Parameter, Stage, main
 from shared.errors import LimnError
@@ -26,6 +31,7 @@ STAGE = Stage(
     version=5,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
+    joins=("sample_frames", "track_landmarks", "init_albedo"),
     outputs=(
         Output("maps/*.exr", "albedo, specular intensity, roughness, normal, confidence", space="uv",
                colour_space="in each file"),
@@ -34,6 +40,11 @@ STAGE = Stage(
         Output("poses.npz", "camera_from_head [F, 4, 4], frame_index [F], intrinsics of source and crop", unit="mm"),
         Output("renders/*.exr", "re-renders of chosen crops, 0 outside the head", space="crop",
                colour_space="lin_rec709_scene"),
+        Output("clips/*/envmap.exr", "the light of another clip", space="world", colour_space="lin_rec709_scene",
+               optional=True),
+        Output("clips/*/poses.npz", "the poses of another clip", unit="mm", optional=True),
+        Output("clips/*/renders/*.exr", "re-renders of another clip", space="crop", colour_space="lin_rec709_scene",
+               optional=True),
         Output("solve.json", "model, residuals, steps, scale of the albedo, held-out frames, warnings"),
     ),
     parameters=(
@@ -180,8 +191,7 @@ def read_reference(job: Job, checkpoint):
 
 
 def write_maps(job: Job, result) -> None:
-    """maps/*.exr and envmap.exr."""
-    from shared.envmap import latlong_from_cube
+    """maps/*.exr."""
     from shared.io.images import write_exr
 
     (job.out / "maps").mkdir()
@@ -189,54 +199,85 @@ def write_maps(job: Job, result) -> None:
         colour_space = "lin_rec709_scene" if name == "diffuse_albedo" else "data"
         attributes = {"content": FLAT_NORMALS} if name == "normal" else {}
         write_exr(job.out / "maps" / f"{name}.exr", image, colour_space=colour_space, attributes=attributes)
-    latlong = latlong_from_cube(result.solution.state.light, LATLONG_HEIGHT)
-    write_exr(job.out / "envmap.exr", latlong, colour_space="lin_rec709_scene", latlong=True)
 
 
-def write_renders(job: Job, inputs, result, frame_index) -> list[int]:
-    """renders/%06d.exr of evenly spread frames -> their indices in the source."""
+def write_clip(job: Job, folder: Path, clip, first: int, result, light, poses) -> dict:
+    """envmap.exr, poses.npz and renders/%06d.exr of a clip -> which frames of its source were re-rendered, which held
+    out.
+
+    clip: its ClipInputs; first: of its frames, among all that were solved; light [6 n^2, 3]; poses [F, 4, 4].
+    """
+    from shared.envmap import latlong_from_cube
+    from shared.io.arrays import save_arrays
     from shared.io.images import write_exr
     from shared.render import SurfaceMaps, render_frame
     from shared.solve.capture import spread_frames
 
-    (job.out / "renders").mkdir()
+    (folder / "renders").mkdir(parents=True)
+    latlong = latlong_from_cube(light, LATLONG_HEIGHT)
+    write_exr(folder / "envmap.exr", latlong, colour_space="lin_rec709_scene", latlong=True)
+    frames, index = clip.frames, clip.frame_index
+    save_arrays(
+        folder / "poses.npz",
+        camera_from_head=poses,
+        frame_index=index,
+        intrinsics=frames.intrinsics_source,
+        intrinsics_crop=frames.intrinsics,
+    )
     maps = SurfaceMaps(result.maps["diffuse_albedo"], result.maps["specular_intensity"])
-    chosen = spread_frames(len(frame_index), job.params.render_count)
+    chosen = spread_frames(len(index), job.params.render_count)
     for f in job.progress(chosen, "re-rendering"):
-        pose = inputs.camera_from_head[f]
-        image, _ = render_frame(result.viewer, result.shading, maps, f, pose, inputs.intrinsics, inputs.size)
-        write_exr(job.out / "renders" / f"{frame_index[f]:06d}.exr", image, colour_space="lin_rec709_scene")
-    return [int(frame_index[f]) for f in chosen]
+        image, _ = render_frame(result.viewer, result.shading, maps, first + f, poses[f], clip.intrinsics, clip.size)
+        write_exr(folder / "renders" / f"{index[f]:06d}.exr", image, colour_space="lin_rec709_scene")
+    held_out = index[~result.fitted[first : first + len(index)]]
+    return {"render_frames": index[chosen].tolist(), "held_out_frames": held_out.tolist()}
+
+
+def read_clips(job: Job) -> tuple:
+    """The clip's inputs, or those of all clips."""
+    from shared.errors import InputError
+    from shared.io.clip_inputs import read_inputs
+
+    params = job.params
+    given = {"mesh": bool(params.mesh), "poses": bool(params.poses), "fit_frames": params.fit_frames > 0,
+             "solver": params.solver == "reference"}
+    for name in (name for name, is_given in given.items() if is_given and job.clips):
+        raise InputError("works on one clip only", where=f"--set inverse_render.{name}", got=f"{len(job.clips)} clips",
+                         mend="leave it out, or make a subject of one clip")
+    folders = [(job.input("sample_frames", clip), job.input("track_landmarks", clip)) for clip in job.clips or ("",)]
+    return tuple(read_inputs(*pair, params.mesh, params.poses) for pair in folders)
 
 
 def run(job: Job) -> None:
     """Solve the light, then the texels; write and re-render."""
-    from shared.io.arrays import save_arrays, write_json
-    from shared.io.clip_inputs import read_inputs
+    import numpy as np
+
+    from shared.io.arrays import write_json
     from shared.io.meshes import save_mesh
     from shared.solve.inverse import solve_clip, summarise
+    from shared.solve.joint_clips import join_clips
     from shared.solve.reshape import segments_of
 
-    folders = job.input("sample_frames"), job.input("track_landmarks")
-    inputs, frames, frame_index = read_inputs(*folders, job.params.mesh, job.params.poses)
+    clips = read_clips(job)
+    inputs = join_clips(clips) if job.clips else clips[0]
     sights = inputs.chart_sights() if job.params.chart else ()
     settings = read_settings(job, job.out.parent / CHECKPOINT)
     result = solve_clip(inputs, settings, job.progress, job.note, sights)
-    record = summarise(inputs, result, frame_index)
+    record = summarise(inputs, result)
     for text in record["warnings"]:
         job.warn(text)
     write_maps(job, result)
     segment = segments_of(inputs, result.viewer.mesh)
     extra = {} if segment is None else {"face_segment": segment}
     save_mesh(job.out / "mesh.npz", result.viewer.mesh, **extra)
-    save_arrays(
-        job.out / "poses.npz",
-        camera_from_head=inputs.camera_from_head,
-        frame_index=frame_index,
-        intrinsics=frames.intrinsics_source,
-        intrinsics_crop=frames.intrinsics,
-    )
-    record["render_frames"] = write_renders(job, inputs, result, frame_index)
+    lights, own = np.split(result.solution.state.light, len(clips)), []
+    for k, clip in enumerate(clips):
+        folder, rows = job.out / "clips" / job.clips[k] if k else job.out, np.nonzero(inputs.light_index == k)[0]
+        own.append(write_clip(job, folder, clip, rows[0], result, lights[k], inputs.camera_from_head[rows]))
+    record |= own[0]
+    if job.clips:
+        described = zip(job.clips, inputs.describe(), own, strict=True)
+        record["clips"] = [{"name": name, **placed, **frames} for name, placed, frames in described]
     write_json(job.out / "solve.json", record)
 
 
@@ -252,12 +293,15 @@ def check(job: Job) -> None:
             raise LimnError(f"{name} leaves [0, {highest:g}]: {image.min():.3f} .. {image.max():.3f}")
     if not (maps["confidence"] > 0.5).mean() > 0.01:
         raise LimnError("less than a hundredth of the map is determined by the clip")
-    light = read_exr(job.out / "envmap.exr")
-    if light.min() < 0.0 or light.max() <= 0.0:
-        raise LimnError("the light is not positive")
-    for frame in read_json(job.out / "solve.json")["render_frames"]:
-        if read_exr(job.out / "renders" / f"{frame:06d}.exr").max() <= 0.0:
-            raise LimnError(f"the re-render of frame {frame} is black")
+    record = read_json(job.out / "solve.json")
+    others = {job.out / "clips" / clip["name"]: clip for clip in record.get("clips", ())[1:]}
+    for folder, clip in ({job.out: record} | others).items():
+        light = read_exr(folder / "envmap.exr")
+        if light.min() < 0.0 or light.max() <= 0.0:
+            raise LimnError("the light is not positive")
+        for frame in clip["render_frames"]:
+            if read_exr(folder / "renders" / f"{frame:06d}.exr").max() <= 0.0:
+                raise LimnError(f"the re-render of frame {frame} is black")
 
 
 if __name__ == "__main__":

@@ -173,10 +173,10 @@ class PlateShading:
         tilt = self.uvs @ [np.cos(angle), np.sin(angle)]
         return ((0.7 + 0.25 * tilt + 0.2 * np.sin(1.7 * frame))[:, None] * [1.0, 0.95, 0.9]).astype(np.float32)
 
-    def mean_irradiance(self):
-        return np.mean([self.irradiance(frame) for frame in range(FRAMES)], axis=0)
+    def mean_irradiance(self, frames):
+        return np.mean([self.irradiance(frame) for frame in frames], axis=0)
 
-    def mean_slope(self):
+    def mean_slope(self, frames):
         return np.zeros((len(self.uvs), 3))
 
     def reflection(self, frame):

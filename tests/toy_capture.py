@@ -41,36 +41,43 @@ def swinging(frames=FRAMES):
     return rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors), np.tile([0, 0, 900.0], (frames, 1)))
 
 
-def make_truth(specular=SPECULAR, clip_at=np.inf, roughness_at=lambda positions: ROUGHNESS):
+def make_truth(
+    specular=SPECULAR, clip_at=np.inf, roughness_at=lambda positions: ROUGHNESS, lights=(true_light,), noise=NOISE
+):
     """Capture, true albedo [P, 3] and true irradiance [P, F, 3], put together from the forward modules.
 
-    roughness_at: of points [P, 3], one value or [P].
+    roughness_at: of points [P, 3], one value or [P]; lights: functions of directions, FRAMES frames in each.
     """
     mesh = toy_head(4).mesh(np.zeros(2), np.zeros(1))
-    scene, nodes, poses = RayScene(mesh.vertices, mesh.faces), bounce_nodes(mesh, 80), swinging()
+    scene, nodes = RayScene(mesh.vertices, mesh.faces), bounce_nodes(mesh, 80)
+    poses, light_index = np.tile(swinging(), (len(lights), 1, 1)), np.repeat(np.arange(len(lights)), FRAMES)
+    frames = len(poses)
     front = np.nonzero(mesh.vertices[:, 2] > 15.0)[0]
     points = mesh_points(mesh, front)
     transfer, node_transfer = (trace_transfer(scene, some, nodes, DIRECTIONS) for some in (points, nodes.points))
     turns = world_from_head(poses, "head")
-    along = light_along(true_light(cube_directions(16)), DIRECTIONS, turns)
+    cubes = np.concatenate([light(cube_directions(16)) for light in lights])
+    along = light_along(cubes, DIRECTIONS, turns, light_index)
     node_albedo = true_albedo(nodes.points.positions) + specular * hemispherical_albedo(ROUGHNESS)
     matrices, direct = node_radiosity(node_transfer, node_albedo), node_transfer.direct.astype(np.float64)
     radiosity = np.stack([matrices[..., c] @ direct @ along[..., c] for c in range(3)], axis=-1)
     flat = along.reshape(len(DIRECTIONS), -1), radiosity.reshape(len(direct), -1)
-    light = irradiance(transfer, *flat).reshape(len(points), FRAMES, 3)
+    light = irradiance(transfer, *flat).reshape(len(points), frames, 3)
     towards = normalised(camera_centres(poses)[None] - points.positions[:, None])
     table = LobeTable(points.normals, transfer.visibility(), DIRECTIONS)
     roughness = roughness_at(points.positions)
-    lobes = [specular_reflection(table, towards[:, f], roughness, along[:, f]) for f in range(FRAMES)]
+    lobes = [specular_reflection(table, towards[:, f], roughness, along[:, f]) for f in range(frames)]
     albedo = true_albedo(points.positions)
     colours = albedo[:, None] * light + specular * np.stack(lobes, axis=1)
-    colours += NOISE * np.random.default_rng(0).normal(size=colours.shape)
+    colours += noise * np.random.default_rng(0).normal(size=colours.shape)
     cosine = (towards * points.normals[:, None]).sum(2)
     weight = np.where(cosine > 0.2, cosine**2, 0.0).astype(np.float32)
     limits = (colours > clip_at).astype(np.int8)
     samples = Samples(np.clip(colours, 0, clip_at).astype(np.float32), weight, limits, towards.astype(np.float32))
-    fitted, skin = np.arange(FRAMES) % 5 != 2, np.ones(len(points), bool)
-    capture = Capture(points, samples, transfer, nodes, node_transfer, DIRECTIONS, turns, fitted, skin)
+    fitted, skin = np.tile(np.arange(FRAMES) % 5 != 2, len(lights)), np.ones(len(points), bool)
+    capture = Capture(
+        points, samples, transfer, nodes, node_transfer, DIRECTIONS, turns, fitted, skin, light_index=light_index
+    )
     seen = (weight[:, fitted] > 0).sum(1) >= 4
     index = np.nonzero(seen)[0]
     parts = {"points": points.take(index), "samples": samples.points(index), "transfer": transfer.take(index)}

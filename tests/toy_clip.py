@@ -32,6 +32,10 @@ class ToyClip:
     face_segment: np.ndarray | None = None
     segment_names: tuple[str, ...] = ()
 
+    @property
+    def light_index(self):
+        return np.zeros(len(self.camera_from_head), int)
+
     def picture(self, f):
         return self.pictures[f]
 

@@ -1,13 +1,16 @@
 """Measures inverse_render on a subject whose truth is known: accuracy by case, and cost over sizes.
 
-    python -m tools.bench_appearance SUBJECT RUN [--tracked] [--cases full no_bounce ...] [--set key=value] [--out DIR]
+    python -m tools.bench_appearance SUBJECT RUN [--with SUBJECT RUN] [--tracked] [--cases full no_bounce ...]
+        [--set key=value] [--out DIR]
     python -m tools.bench_appearance SUBJECT RUN --cost
         times over 4 numbers of frames and 4 sizes of the maps, with the crops enlarged to 1K and frames repeated
 
 SUBJECT: a folder with gt/; RUN: a run's folder whose work/ holds sample_frames and track_landmarks. True mesh and poses
-are used unless --tracked. Each case solves the clip anew with some models switched off, and is compared with the truth:
-albedo (dE2000 after one gain per channel, and raw), specular intensity and roughness where confidence is over one half,
-light through a 25 degree lobe, and re-renders against the video on the face skin, on fitted and on held-out frames.
+are used unless --tracked. --with: another clip of the same head in another light, solved together with the first one,
+on whose truth the result is measured. Each case solves the clip anew with some models switched off, and is compared
+with the truth: albedo (dE2000 after one gain per channel, and raw), specular intensity and roughness where confidence
+is over one half, light through a 25 degree lobe, and re-renders against the video on the face skin, on fitted and on
+held-out frames.
 """
 
 from __future__ import annotations
@@ -16,7 +19,8 @@ import argparse
 import json
 import resource
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -34,6 +38,7 @@ from shared.mesh import Mesh, interpolate
 from shared.raycast import RayScene, camera_hits
 from shared.render import SurfaceMaps, render_frame
 from shared.solve.inverse import InverseResult, solve_clip
+from shared.solve.joint_clips import join_clips
 from shared.texture import sample_bilinear
 from stages.inverse_render import STAGE, read_settings
 from tools import score_measures
@@ -77,8 +82,8 @@ def settings_of(changes: dict):
 def open_clip(subject: Path, run: Path, tracked: bool) -> tuple[ClipInputs, np.ndarray]:
     """Inputs and the frames' numbers in the source."""
     truth = ("", "") if tracked else (str(subject / "gt" / "mesh.obj"), str(subject / "gt" / "poses.npz"))
-    inputs, _, index = read_inputs(run / "work" / "sample_frames", run / "work" / "track_landmarks", *truth)
-    return inputs, index
+    inputs = read_inputs(run / "work" / "sample_frames", run / "work" / "track_landmarks", *truth)
+    return inputs, inputs.frame_index
 
 
 def crop_of(buffer: np.ndarray, inputs: ClipInputs) -> np.ndarray:
@@ -172,7 +177,7 @@ def render_errors(subject: Path, inputs: ClipInputs, result: InverseResult) -> d
     maps = SurfaceMaps(*(result.maps[name] for name in ("diffuse_albedo", "specular_intensity")))
     errors: dict[str, list] = {"fitted": [], "held_out": []}
     for name, chosen in (("fitted", result.fitted), ("held_out", ~result.fitted)):
-        index = np.nonzero(chosen)[0]
+        index = np.nonzero(chosen[: len(inputs.camera_from_head)])[0]
         for f in index[np.unique(np.linspace(0, len(index) - 1, RENDERED_FRAMES).astype(int))]:
             frame, pose = int(inputs.frames.frame_index[inputs.place[f]]), inputs.camera_from_head[f]
             face, bary, _ = camera_hits(scene, poses[frame], inputs.intrinsics, *inputs.size)
@@ -192,16 +197,24 @@ def render_errors(subject: Path, inputs: ClipInputs, result: InverseResult) -> d
     return {f"rerender_{name}": float(-10 * np.log10(total / count)) for name, (total, count) in mean.items()}
 
 
-def measure(subject: Path, inputs: ClipInputs, index: np.ndarray, changes: dict, note: Callable) -> tuple[dict, object]:
-    """Solves one case and compares it with the truth -> scores and the result."""
+def measure(
+    subject: Path, clips: Sequence[ClipInputs], index: np.ndarray, changes: dict, note: Callable
+) -> tuple[dict, object]:
+    """Solves one case and compares it with the first clip's truth -> scores and the result; index [F]: its frames."""
     start = time.perf_counter()
     job = _Job(changes)
-    sights = inputs.chart_sights() if job.params.chart else ()
-    result = solve_clip(inputs, read_settings(job), silent, note, sights)
+    inputs, sights = clips[0], clips[0].chart_sights() if job.params.chart else ()
+    together = inputs
+    if len(clips) > 1:
+        together = join_clips(clips)
+        inputs = replace(inputs, camera_from_head=together.camera_from_head[: len(index)])
+        note(f"mesh of clip {together.main}; track points of the clips lie {together.placed_mm} mm from it")
+    result = solve_clip(together, read_settings(job), silent, note, sights)
     scores = {"seconds": time.perf_counter() - start}
     scores["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     scores |= map_errors(subject, inputs, index, result.viewer.mesh, result.maps)
-    scores |= light_errors(subject, latlong_from_cube(result.solution.state.light, 128))
+    light = np.split(result.solution.state.light, len(clips))[0]
+    scores |= light_errors(subject, latlong_from_cube(light, 128))
     has_relight = (subject / "relight").is_dir()
     relit = relight_errors(subject, result, settings_of(changes), inputs.camera_from_head, index) if has_relight else {}
     scores |= {f"relight_{name}": [errors["psnr"], errors["psnr_gain"]] for name, errors in relit.items()}
@@ -220,7 +233,7 @@ class LargeClip:
         self.size = (round(inputs.size[0] * self.factor), LARGE_CROP)
         self.intrinsics = np.diag([self.factor, self.factor, 1.0]) @ inputs.intrinsics
         self.camera_from_head = inputs.camera_from_head[self._frame]
-        self.mesh, self.moves = inputs.mesh, inputs.moves
+        self.mesh, self.moves, self.light_index = inputs.mesh, inputs.moves, inputs.light_index[self._frame]
         self.face_segment, self.segment_names, self.tracks = inputs.face_segment, inputs.segment_names, inputs.tracks
 
     def picture(self, f: int) -> Picture:
@@ -255,6 +268,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("subject", type=Path)
     parser.add_argument("run", type=Path)
+    parser.add_argument("--with", dest="other", nargs=2, type=Path, metavar=("SUBJECT", "RUN"), help="a second clip")
     parser.add_argument("--tracked", action="store_true", help="tracked mesh and poses instead of the true ones")
     parser.add_argument("--cases", nargs="*", default=["full"], choices=CASES)
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="parameters for every case")
@@ -262,12 +276,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--cost", action="store_true", help="times over sizes instead of accuracy")
     options = parser.parse_args(arguments)
     inputs, index = open_clip(options.subject, options.run, options.tracked)
+    clips = [inputs, *([open_clip(*options.other, options.tracked)[0]] if options.other else [])]
     given = dict(setting.split("=", 1) for setting in options.set)
     if options.cost:
         cost_table(inputs, given)
         return 0
     for case in options.cases:
-        scores, result = measure(options.subject, inputs, index, {**given, **CASES[case]}, print)
+        scores, result = measure(options.subject, clips, index, {**given, **CASES[case]}, print)
         rounded = {key: round(value, 4) if isinstance(value, float) else value for key, value in scores.items()}
         print(case, json.dumps(rounded))
         if options.out:

@@ -25,7 +25,7 @@ class _RelitClip:
     """What shade_vertices reads: the cameras of the relit pictures, in the result's head space."""
 
     def __init__(self, poses: np.ndarray):
-        self.camera_from_head, self.moves = poses, "head"
+        self.camera_from_head, self.moves, self.light_index = poses, "head", np.zeros(len(poses), int)
 
 
 def result_poses(truth_poses: np.ndarray, alignment) -> np.ndarray:

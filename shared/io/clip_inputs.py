@@ -37,6 +37,16 @@ class ClipInputs:
     segment_names: tuple[str, ...]
     tracks: tuple[np.ndarray, np.ndarray] | None = None
 
+    @property
+    def frame_index(self) -> np.ndarray:
+        """[F] int64: the frames' numbers in the source."""
+        return self.frames.frame_index[self.place].astype(np.int64)
+
+    @property
+    def light_index(self) -> np.ndarray:
+        """[F]: all frames stand in one light."""
+        return np.zeros(len(self.camera_from_head), int)
+
     def picture(self, f: int) -> Picture:
         """Frame f, decoded and ready for sampling."""
         i = int(self.place[f])
@@ -47,14 +57,11 @@ class ClipInputs:
 
     def chart_sights(self) -> tuple[ChartSight, ...]:
         """The colour chart in the frames where one was found."""
-        index = self.frames.frame_index[self.place]
-        return tuple(ChartSight.from_record(record, self.frames.crop, index) for record in self.frames.chart)
+        return tuple(ChartSight.from_record(record, self.frames.crop, self.frame_index) for record in self.frames.chart)
 
 
-def read_inputs(
-    sampled: Path, tracked: Path, mesh_path: str = "", pose_path: str = ""
-) -> tuple[ClipInputs, FrameSet, np.ndarray]:
-    """From the folders of sample_frames and track_landmarks -> inputs, the frames, frame_index [F] in the source.
+def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: str = "") -> ClipInputs:
+    """From the folders of sample_frames and track_landmarks.
 
     The intrinsics are those of track_landmarks, which may have solved the focal length.
 
@@ -71,13 +78,12 @@ def read_inputs(
     poses = load_arrays(Path(pose_path)) if pose_path else tracked_poses
     points = None if mesh_path or pose_path else load_arrays(tracked / "tracks.npz")
     tracks = None if points is None else (points["points_head"], points["residual_px"])
-    pose, index, place = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
-    inputs = ClipInputs(mesh, pose, frames.intrinsics, frames.size, frames.moves, frames, place, segment, names, tracks)
-    return inputs, frames, index
+    pose, place = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
+    return ClipInputs(mesh, pose, frames.intrinsics, frames.size, frames.moves, frames, place, segment, names, tracks)
 
 
-def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Poses of sampled frames [F, 4, 4], their frame_index [F] and place in the frame set [F]."""
+def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of sampled frames [F, 4, 4] and their place in the frame set [F]."""
     if "camera_from_head" not in poses:
         raise InputError("no camera_from_head", where=where, got=", ".join(sorted(poses)))
     pose = poses["camera_from_head"].astype(np.float64)
@@ -86,5 +92,4 @@ def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.nd
     kept = [i for i, frame in enumerate(index) if int(frame) in place]
     if len(kept) < 3:
         raise InputError("too few poses belong to sampled frames", where=where, got=len(kept), expected="3 or more")
-    index = np.asarray(index)[kept].astype(np.int64)
-    return pose[kept], index, np.array([place[int(frame)] for frame in index])
+    return pose[kept], np.array([place[int(index[i])] for i in kept])

@@ -26,7 +26,7 @@ from shared.gather import Samples, satisfied
 from shared.lobes import LobeTable, specular_tables
 from shared.solve.chart_scale import ChartStatement
 from shared.solve.light import FrameLight, LightPriors
-from shared.solve.light_models import LampLight, LogLight, make_light_model
+from shared.solve.light_models import LightModel, make_light_model
 from shared.solve.scale import Highlights, most_likely_irradiance
 from shared.transfer import Nodes, Points, Transfer, nearest_points, node_radiosity
 
@@ -76,7 +76,8 @@ class Capture:
 
     points [P] with samples [P, F] and transfer; nodes and their own transfer; directions [J, 3];
     world_from_head [F, 3, 3]; fitted [F] bool (the other frames are held out); skin [P] bool: where the prior on skin
-    reflectance applies; chart: what a colour chart says about the light's scale.
+    reflectance applies; chart: what a colour chart says about the light's scale; light_index [F]: which of several
+    lights each frame stands in, None: there is one.
     """
 
     points: Points
@@ -89,15 +90,27 @@ class Capture:
     fitted: np.ndarray
     skin: np.ndarray
     chart: ChartStatement | None = None
+    light_index: np.ndarray | None = None
+
+    @property
+    def frames_of_lights(self) -> list[np.ndarray]:
+        """Of each light, the indices of its frames."""
+        return frames_of_lights(self.light_index, len(self.world_from_head))
+
+
+def frames_of_lights(light_index: np.ndarray | None, count: int) -> list[np.ndarray]:
+    """Of each light, the indices of its frames out of count; light_index [count]: each frame's light, None: one."""
+    index = np.zeros(count, int) if light_index is None else light_index
+    return [np.nonzero(index == light)[0] for light in range(int(index.max(initial=0)) + 1)]
 
 
 @dataclass
 class State:
     """The light's parameters [M, 3] and the model they belong to, specular intensity, roughness, albedo [P, 3],
-    node_albedo [K, 3]."""
+    node_albedo [K, 3]. Of several lights all parameters and texels lie one below the other."""
 
     params: np.ndarray
-    light_model: LogLight | LampLight
+    light_model: LightModel
     specular: float
     roughness: float
     albedo: np.ndarray
@@ -126,6 +139,7 @@ class AppearanceSolver:
         sigma = settings.noise[0] + settings.noise[1] * self.colours
         self.precision = 1.0 / (sigma * sigma)
         self.fitted = torch.from_numpy(capture.fitted.astype(np.float32))
+        self.light_frames = capture.frames_of_lights
         self.table = LobeTable(capture.points.normals, capture.transfer.visibility(), capture.directions)
         self.node_to_point = nearest_points(capture.nodes.points, capture.points)
         self.direct = torch.from_numpy(capture.transfer.direct.astype(np.float32))
@@ -136,18 +150,21 @@ class AppearanceSolver:
 
     # ------------------------------------------------------------------ set-up
     def _start(self) -> State:
-        """A uniform light of the level that the priors prefer for this radiance."""
+        """Uniform lights of the level that the priors prefer for this radiance."""
         weight = (self.trust * self._skin()).double()
         radiance = ((weight * self.colours).sum((1, 2)) / weight.sum()).numpy()
+        levels = [(weight * self.colours)[..., own].sum((1, 2)).numpy() / weight[..., own].sum().item() / radiance
+                  for own in self.light_frames]
         open_share = float((self.direct.sum(1) * weight[0].sum(1)).sum() / weight.sum())
         irradiance = np.exp(most_likely_irradiance(np.log(radiance), self.settings.white_sigma))
         albedo = radiance / irradiance
         resolution = self.settings.light_schedule[0][1]
-        log_light = np.broadcast_to(np.log(irradiance / open_share), (6 * resolution**2, 3)).copy()
+        log_light = np.repeat(np.log(irradiance / open_share * np.array(levels)), 6 * resolution**2, axis=0)
         points, nodes = len(self.capture.points), len(self.capture.nodes.points)
         specular = self.settings.specular_prior[0] if self.settings.specular else 0.0
         everywhere = (np.tile(albedo, (count, 1)) for count in (points, nodes))
-        return State(log_light, LogLight(resolution), specular, self.settings.roughness, *everywhere)
+        model = make_light_model("cubemap", resolution, len(self.light_frames))
+        return State(log_light, model, specular, self.settings.roughness, *everywhere)
 
     def start_from(self, state: State) -> None:
         """Light, specular intensity and roughness of a state of other points; the albedo is its typical one."""
@@ -160,8 +177,10 @@ class AppearanceSolver:
 
     def set_light(self, stage: tuple[str, int]) -> None:
         """Goes on with a light of another model or resolution, as close to the present one as it can be."""
-        model = make_light_model(*stage)
-        self.frame_light = FrameLight(model.resolution, self.capture.directions, self.capture.world_from_head)
+        model, capture = make_light_model(*stage, len(self.light_frames)), self.capture
+        self.frame_light = FrameLight(
+            model.resolution, capture.directions, capture.world_from_head, capture.light_index
+        )
         self.state.params, self.state.light_model = model.fit(self.state.light), model
 
     def subset(self, index: slice) -> AppearanceSolver:
@@ -237,6 +256,14 @@ class AppearanceSolver:
         gauge = self.frame_light.adjoint(spread.permute(1, 2, 0).contiguous().numpy())
         return log_albedo.double().numpy(), torch.log(mean).double().numpy(), gauge
 
+    def relative_light(self, irradiance: torch.Tensor) -> np.ndarray:
+        """[L, 3]: log of the skin's mean irradiance in the frames of each light, relative to that in all frames."""
+        weight = self.trust * self._skin()
+        mean = (weight * irradiance).sum((1, 2)) / weight.sum()
+        own = [(weight * irradiance)[..., frames].sum((1, 2)) / weight[..., frames].sum()
+               for frames in self.light_frames]
+        return torch.log(torch.stack(own) / mean).double().numpy()
+
     # ------------------------------------------------------------------ eliminated unknowns
     def weights(self, model: torch.Tensor | None) -> torch.Tensor:
         """[3, P, F] inverse variances: trust, robust loss, and zero where a censored sample is satisfied."""
@@ -305,9 +332,10 @@ class AppearanceSolver:
         return Highlights(intensity, curvature.double().numpy() * self.evidence(weight), share.double().numpy())
 
     def evidence(self, weight: torch.Tensor) -> float:
-        """Scales the data term so that its samples count as settings.independent ones of the variance found."""
+        """Scales the data term so that each light's samples count as settings.independent ones of the variance found.
+        """
         count = float((weight * self.fitted > 0).sum()) / 3.0
-        return self.settings.independent / (max(count, 1.0) * self.misfit)
+        return len(self.light_frames) * self.settings.independent / (max(count, 1.0) * self.misfit)
 
     def measure_misfit(self, model: torch.Tensor, weight: torch.Tensor) -> None:
         """Variance of the residuals over the assumed noise's, at least 1: where the model cannot follow the clip, the

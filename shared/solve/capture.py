@@ -11,7 +11,7 @@ from shared.gather import Picture, SurfaceViewer, gather_samples
 from shared.geometry import fibonacci_sphere, world_from_head
 from shared.raycast import RayScene
 from shared.shading import DEEP
-from shared.solve.appearance import Capture
+from shared.solve.appearance import Capture, frames_of_lights
 from shared.transfer import (
     Nodes,
     Points,
@@ -60,15 +60,27 @@ def set_scenery(viewer: SurfaceViewer, sizes: Sizes, visibility: bool = True) ->
     return Scenery(viewer.scene, directions, nodes, node_transfer, visibility)
 
 
-def spread_frames(count: int, wanted: int) -> np.ndarray:
-    """At most wanted indices, evenly over range(count)."""
-    return np.unique(np.round(np.linspace(0, count - 1, min(wanted, count))).astype(int))
+def spread_frames(count: int, wanted: int, light_index: np.ndarray | None = None) -> np.ndarray:
+    """At most wanted indices, evenly over range(count); of several lights, as many of each."""
+    frames = frames_of_lights(light_index, count)
+    spread = [own[np.unique(np.round(np.linspace(0, len(own) - 1, min(wanted, len(own)))).astype(int))]
+              for own in frames]
+    return np.concatenate(spread)
 
 
-def hold_out(count: int, every: int) -> np.ndarray:
-    """[count] bool, True for fitted frames: every every-th frame is held out, starting in the middle of a period."""
-    index = np.arange(count)
-    return (index % every != every // 2) if count > every else index >= 0
+def hold_out(count: int, every: int, light_index: np.ndarray | None = None) -> np.ndarray:
+    """[count] bool, True for fitted frames: every every-th frame is held out, starting in the middle of a period; of
+    several lights, among the frames of each."""
+    fitted = np.ones(count, bool)
+    for own in frames_of_lights(light_index, count):
+        if len(own) > every:
+            fitted[own[every // 2 :: every]] = False
+    return fitted
+
+
+def lens_of_frames(intrinsics: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Intrinsics [3, 3] of all frames as they are, of [F, 3, 3] those of some frames."""
+    return intrinsics if intrinsics.ndim == 2 else intrinsics[frames]
 
 
 def face_front(viewer: SurfaceViewer, camera_from_head: np.ndarray, limit: float) -> np.ndarray:
@@ -95,11 +107,13 @@ def build_capture(
     skin: np.ndarray,
     count: int,
     progress: Callable = iter,
+    light_index: np.ndarray | None = None,
 ) -> Capture:
     """Samples and transfer of at most count vertices in F frames.
 
-    pictures: the F frames in order; camera_from_head [F, 4, 4]; fitted [F]; allowed, skin [V] bool: vertices that may
-    be chosen, and where the prior on skin reflectance applies. Vertices seen in fewer than MINIMUM_FRAMES fitted frames
+    pictures: the F frames in order; camera_from_head [F, 4, 4]; intrinsics [3, 3], or [F, 3, 3] of each; fitted [F];
+    allowed, skin [V] bool: vertices that may be chosen, and where the prior on skin reflectance applies; light_index
+    [F]: each frame's light, None: there is one. Vertices seen in fewer than MINIMUM_FRAMES fitted frames
     or deep inside the mesh are left out.
     """
     front = allowed & face_front(viewer, camera_from_head, 0.2)
@@ -122,4 +136,5 @@ def build_capture(
         world_from_head=world_from_head(camera_from_head, moves),
         fitted=fitted,
         skin=skin[index[chosen]],
+        light_index=light_index,
     )

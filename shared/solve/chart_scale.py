@@ -118,9 +118,10 @@ def _between_depths(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ChartStatement:
-    """Views of a chart in the frames of a clip."""
+    """Views of a chart in the frames of a clip; light: which of several it stands in."""
 
     views: tuple[ChartView, ...]
+    light: int = 0
 
     def log_factor(self, light: np.ndarray, skin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How much brighter the light [6 n^2, 3] should be: log factor [3] and its covariance [3, 3].
@@ -146,15 +147,21 @@ def _sphere(resolution: int):
 
 
 def state_chart(
-    sights: Sequence[ChartSight], scene: RayScene, camera_from_head: np.ndarray, intrinsics: np.ndarray, moves: str
+    sights: Sequence[ChartSight],
+    scene: RayScene,
+    camera_from_head: np.ndarray,
+    intrinsics: np.ndarray,
+    moves: str,
+    light: int = 0,
 ) -> tuple[ChartStatement | None, str]:
     """What a chart says -> statement, or None and a warning ("" without any chart).
 
-    scene: the head's mesh; camera_from_head [F, 4, 4], intrinsics [3, 3] of the pictures; moves: what moves against the
-    light, "head" or "camera".
+    scene: the head's mesh; camera_from_head [F, 4, 4], intrinsics [3, 3] of the pictures, or [F, 3, 3] of each; moves:
+    what moves against the light, "head" or "camera"; light: which of several the chart stands in.
     """
-    views = []
+    views, lenses = [], np.broadcast_to(intrinsics, (len(camera_from_head), 3, 3))
     for sight in sights:
+        intrinsics = lenses[sight.frame]
         normals, log_weight = chart_normals(sight.corners, intrinsics)
         chance = np.exp(log_weight - log_weight.max())
         mean = chance @ normals / chance.sum()
@@ -167,7 +174,7 @@ def state_chart(
             free = _open_directions(points, scene, pose, directions @ world_from_camera)
             views.append(ChartView(sight, cosine, log_weight, free))
     if views:
-        return ChartStatement(tuple(views)), ""
+        return ChartStatement(tuple(views), light), ""
     return None, "the colour chart is turned away from the camera: not used" if sights else ""
 
 

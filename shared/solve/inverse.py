@@ -21,12 +21,14 @@ from shared.solve.capture import (
     build_capture,
     face_front,
     hold_out,
+    lens_of_frames,
     set_scenery,
     spread_frames,
 )
 from shared.solve.chart_scale import describe_scale, doubt_scale, state_chart
 from shared.solve.fit_appearance import Solution, fit_appearance, with_local_roughness
 from shared.solve.frame_choice import covering_frames
+from shared.solve.light_models import SeveralLights
 from shared.solve.reference_settings import ReferenceSettings
 from shared.solve.reshape import faces_of, reshape
 from shared.solve.shape import Reflectance, ShapeSettings
@@ -41,11 +43,12 @@ clothes may cover are left out."""
 
 
 class InverseInputs(Protocol):
-    """What the solver needs of a clip; shared.io.clip_inputs.ClipInputs is one.
+    """What the solver needs of a clip or of several; shared.io.clip_inputs.ClipInputs is one.
 
-    picture(f): frame f of F ready for sampling; camera_from_head [F, 4, 4]; intrinsics [3, 3] and size (width, height)
-    of the pictures; moves: "head" or "camera"; face_segment [faces] or None where the mesh has no segments; tracks:
-    points [N, 3] on the skin with their errors [N], px, or None.
+    picture(f): frame f of F ready for sampling; camera_from_head [F, 4, 4]; intrinsics [3, 3], or [F, 3, 3], and size
+    (width, height) of the pictures; moves: "head" or "camera"; face_segment [faces] or None where the mesh has no
+    segments; tracks: points [N, 3] on the skin with their errors [N], px, or None; light_index [F]: which light each
+    frame stands in, 0 first, frames of one light in a row.
     """
 
     mesh: Mesh
@@ -56,6 +59,7 @@ class InverseInputs(Protocol):
     face_segment: np.ndarray | None
     segment_names: tuple[str, ...]
     tracks: tuple[np.ndarray, np.ndarray] | None
+    light_index: np.ndarray
 
     def picture(self, f: int) -> Picture: ...
 
@@ -108,7 +112,8 @@ def solve_clip(
         return solve_by_reference(inputs, settings, settings.reference, fitted, progress, note)
     scenery = set_scenery(viewer, settings.sizes, settings.appearance.visibility)
     moves = settings.appearance.light_moves(inputs.moves)
-    chart, warning = state_chart(sights, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves)
+    light = int(inputs.light_index[sights[0].frame]) if sights else 0
+    chart, warning = state_chart(sights, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves, light)
     solution, capture = _solve_light(inputs, settings, viewer, scenery, fitted, chart, progress, note)
     shape_record = {"refined": False}
     if settings.shape is not None and inputs.face_segment is not None:
@@ -127,7 +132,7 @@ def solve_clip(
     solution = with_local_roughness(capture, settings.appearance, solution)
     shading = shade_vertices(inputs, settings.appearance, viewer, scenery, solution, progress)
     surface = TexelSurface(inputs.mesh, settings.map_size)
-    clip = Clip(inputs.picture, inputs.camera_from_head, inputs.intrinsics, fitted)
+    clip = Clip(inputs.picture, inputs.camera_from_head, inputs.intrinsics, fitted, inputs.light_index)
     typical = np.median(solution.state.albedo, axis=0)
     texture = TexturePass(surface, viewer, shading, clip, solution.state.specular, typical, progress=progress)
     widths = (np.inf, settings.map_size / 16, settings.map_size / 64) if settings.appearance.specular else (np.inf,)
@@ -152,18 +157,21 @@ def frames_of(
     inputs: InverseInputs, settings: InverseSettings, wanted: int, fitted: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """At most wanted frames, evenly spread, and which of them are fitted."""
-    chosen = spread_frames(len(inputs.camera_from_head), wanted)
+    lights = inputs.light_index
+    chosen = spread_frames(len(inputs.camera_from_head), wanted, lights)
     if settings.fit_frames:
         chosen = np.union1d(chosen, np.nonzero(fitted)[0])
+    if (~fitted[chosen]).sum() >= 2:
+        return chosen, fitted[chosen]
     # Every part of the solve needs held-out frames too: where thinning left too few, hold out among the thinned.
-    return chosen, fitted[chosen] if (~fitted[chosen]).sum() >= 2 else hold_out(len(chosen), settings.hold_out_every)
+    return chosen, hold_out(len(chosen), settings.hold_out_every, lights[chosen])
 
 
 def frames_to_fit(inputs: InverseInputs, settings: InverseSettings, viewer: SurfaceViewer) -> np.ndarray:
     """[F] bool: all frames but those held out, or the few that cover the face."""
     poses = inputs.camera_from_head
     if not settings.fit_frames:
-        return hold_out(len(poses), settings.hold_out_every)
+        return hold_out(len(poses), settings.hold_out_every, inputs.light_index)
     skin = segment_vertices(inputs, FACE_SKIN)
     chosen = covering_frames(viewer, skin, poses, inputs.intrinsics, inputs.size, settings.fit_frames)
     return np.isin(np.arange(len(poses)), chosen)
@@ -188,13 +196,14 @@ def _solve_light(
         scenery,
         read_ahead(inputs.picture, progress(chosen, "gathering samples")),
         inputs.camera_from_head[chosen],
-        inputs.intrinsics,
+        lens_of_frames(inputs.intrinsics, chosen),
         settings.appearance.light_moves(inputs.moves),
         kept,
         allowed=skin,
         skin=skin,
         count=settings.sizes.points,
         progress=lambda items: progress(items, "tracing visibility"),
+        light_index=inputs.light_index[chosen],
     )
     capture = replace(capture, chart=chart)
     return fit_appearance(capture, settings.appearance, lambda record: note(_describe(record)), start), capture
@@ -203,7 +212,9 @@ def _solve_light(
 def describe_light(state) -> str:
     """The light's model in words."""
     model, numbers = state.light_model, len(state.params)
-    return f"cubemap of 6 x {model.resolution}^2 texels from {numbers} numbers per channel"
+    count = model.count if isinstance(model, SeveralLights) else 1
+    several = f"{count} lights, each a " if count > 1 else ""
+    return f"{several}cubemap of 6 x {model.resolution}^2 texels from {numbers // count} numbers per channel"
 
 
 def _describe(record: dict) -> str:
@@ -235,6 +246,7 @@ def shade_vertices(
         inputs.camera_from_head,
         appearance.light_moves(inputs.moves),
         bounce=appearance.bounce,
+        light_index=inputs.light_index,
     )
 
 
@@ -253,8 +265,8 @@ def make_maps(surface: TexelSurface, material: TexelMaterial, roughness: float |
     }
 
 
-def summarise(inputs: InverseInputs, result: InverseResult, frame_index: np.ndarray) -> dict:
-    """What solve.json says, but for the rendered frames. frame_index [F]: the source's numbers of the frames."""
+def summarise(inputs: InverseInputs, result: InverseResult) -> dict:
+    """What solve.json says, but for which frames were rendered and held out."""
     solution, state = result.solution, result.solution.state
     seen = result.material.information > 1.0
     return {
@@ -274,7 +286,6 @@ def summarise(inputs: InverseInputs, result: InverseResult, frame_index: np.ndar
         **{key: result.record[key] for key in ("shape",) if key in result.record},
         "iterations": list(solution.iterations),
         "albedo_scale": result.record["albedo_scale"],
-        "held_out_frames": [int(frame) for frame in frame_index[~result.fitted]],
         "seen_share_of_texels": round(float(seen.mean()), 4),
         "warnings": warnings_about(result),
     }

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.envmap import cube_directions, cube_lookup, cube_smoothness, cube_solid_angles
+from shared.envmap import cube_directions, cube_lookup, cube_smoothness, cube_solid_angles, frame_lookup
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,19 @@ class LightPriors:
 class FrameLight:
     """A cubemap light of a resolution, seen along directions [J, 3] of head space in F frames.
 
-    world_from_head [F, 3, 3] turns head-space directions into the space in which the light stands still.
+    world_from_head [F, 3, 3] turns head-space directions into the space in which the light stands still; light_index
+    [F]: which of several lights, one below the other, each frame stands in; None: there is one.
     """
 
-    def __init__(self, resolution: int, directions: np.ndarray, world_from_head: np.ndarray):
-        self.resolution, self.texels = resolution, 6 * resolution**2
+    def __init__(
+        self,
+        resolution: int,
+        directions: np.ndarray,
+        world_from_head: np.ndarray,
+        light_index: np.ndarray | None = None,
+    ):
         self.shape = (len(directions), len(world_from_head))
-        turned = np.einsum("fij,dj->dfi", world_from_head, directions).reshape(-1, 3)
-        self._lookup = cube_lookup(turned, resolution).astype(np.float32)
+        self._lookup = frame_lookup(directions, world_from_head, resolution, light_index).astype(np.float32)
         self._transposed = self._lookup.T.tocsr()
 
     def along(self, light: np.ndarray) -> np.ndarray:

@@ -177,8 +177,62 @@ class LampLight:
         return np.concatenate(rows + [towards[None]] if self.direction is None else rows)
 
 
-def make_light_model(name: str, resolution: int) -> LogLight | LampLight:
-    """The model of that name (the module's table) on a cubemap of a resolution."""
+class SeveralLights:
+    """Lights of one model, each by itself: their parameters, and their cubemaps, one below the other.
+
+    All raise together: what they are to each other is for the samples to say.
+    """
+
+    def __init__(self, model: LogLight | LampLight, count: int):
+        self.model, self.count, self.resolution = model, count, model.resolution
+        self.unit = np.tile(model.unit, (count, 1))
+        own = np.arange(len(model.unit))
+        moving = own[model.moving_rows]
+        self.moving_rows = (moving + len(own) * np.arange(count)[:, None]).ravel()
+
+    def _each(self, function: Callable, *stacked: np.ndarray) -> np.ndarray:
+        parts = zip(*(np.split(array, self.count) for array in stacked), strict=True)
+        return np.concatenate([function(*part) for part in parts])
+
+    def radiance(self, params: np.ndarray) -> np.ndarray:
+        """[L M, 3] -> [L 6 n^2, 3]."""
+        return self._each(self.model.radiance, params)
+
+    def tangent(self, params: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Change of the radiance [L 6 n^2, 3] with a change of the parameters [L M, 3], to first order."""
+        return self._each(self.model.tangent, params, change)
+
+    def adjoint(self, params: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Transpose of tangent: [L 6 n^2, 3] -> [L M, 3]."""
+        return self._each(self.model.adjoint, params, values)
+
+    def scaled(self, params: np.ndarray, log_factor: np.ndarray) -> np.ndarray:
+        """Parameters of the same lights times exp(log_factor [3])."""
+        return params + self.unit * log_factor
+
+    def prior(self, params: np.ndarray, priors: LightPriors) -> tuple[float, np.ndarray, Callable]:
+        """Sum of the costs, gradient [L M, 3] and Hessian product of the regularisers."""
+        costs, gradients, products = zip(*(self.model.prior(own, priors) for own in np.split(params, self.count)),
+                                         strict=True)
+
+        def product(change: np.ndarray) -> np.ndarray:
+            parts = zip(products, np.split(change, self.count), strict=True)
+            return np.concatenate([of_one(part) for of_one, part in parts])
+
+        return sum(costs), np.concatenate(gradients), product
+
+    def fit(self, radiance: np.ndarray) -> np.ndarray:
+        """Parameters whose lights come closest to cubemaps of any resolution, one below the other -> [L M, 3]."""
+        return self._each(self.model.fit, radiance)
+
+
+LightModel = LogLight | LampLight | SeveralLights
+
+
+def make_light_model(name: str, resolution: int, lights: int = 1) -> LightModel:
+    """The model of that name (the module's table) on a cubemap of a resolution, for one light or several."""
+    if lights > 1:
+        return SeveralLights(make_light_model(name, resolution), lights)
     directions = cube_directions(resolution)
     if name == "cubemap":
         return LogLight(resolution)

@@ -78,11 +78,13 @@ class LightStep:
         highlights = None
         if solver.trust_highlights:
             highlights = solver.highlights(self.irradiance, self.reflection, self.weight)
+        relative = solver.relative_light(self.irradiance)
         chart = solver.capture.chart
         if chart is not None:
-            chart = chart.log_factor(solver.state.light, np.exp(log_albedo + log_irradiance))
+            light = np.split(solver.state.light, len(relative))[chart.light]
+            chart = chart.log_factor(light, np.exp(log_albedo + log_irradiance + relative[chart.light]))
         log_factor, specular = settle_scale(
-            log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart
+            log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart, relative
         )
         factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]
         solver.state.params = self.model.scaled(solver.state.params, log_factor)

@@ -10,7 +10,7 @@ from shared.geometry import camera_centres
 from shared.intersections import move_without_crossing
 from shared.mesh import Mesh, normalised
 from shared.solve.appearance import Settings
-from shared.solve.capture import Sizes
+from shared.solve.capture import Sizes, lens_of_frames
 from shared.solve.shape import HELD, SHAPED, Reflectance, ShapeClip, ShapeSettings, ShapeSolver
 from shared.solve.shape_step import TrackPoints
 
@@ -47,7 +47,7 @@ def track_points(
     """Track points [N, 3] with the depth's standard deviation that their errors [N] and the clip's parallax leave."""
     directions = normalised(camera_centres(camera_from_head))
     half_angle = 0.5 * np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0))
-    px_per_mm = intrinsics[0, 0] / np.median(camera_from_head[:, 2, 3])
+    px_per_mm = np.median(intrinsics[..., 0, 0]) / np.median(camera_from_head[:, 2, 3])
     depth = residual_px / px_per_mm / max(np.sin(half_angle), 0.01)
     known = np.isfinite(depth)
     return TrackPoints(positions[known], np.hypot(TRACK_FLOOR_MM, depth[known]))
@@ -71,10 +71,11 @@ def reshape(
     clip = ShapeClip(
         lambda i: inputs.picture(int(chosen[i])),
         inputs.camera_from_head[chosen],
-        inputs.intrinsics,
+        lens_of_frames(inputs.intrinsics, chosen),
         fitted,
         appearance.light_moves(inputs.moves),
         tracks,
+        inputs.light_index[chosen],
     )
     solver = ShapeSolver(clip, reflectance, appearance, sizes, settings, progress, note)
     start, refined = solver.refine(inputs.mesh, faces_of(inputs, SHAPED), faces_of(inputs, HELD))

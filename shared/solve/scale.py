@@ -89,10 +89,14 @@ def fit_skin_locus(skins: np.ndarray = REFERENCE_SKINS) -> SkinLocus:
 
 
 def scale_prior(
-    log_radiance: np.ndarray, white_sigma: float = WHITE_SIGMA, locus: SkinLocus | None = None
+    log_radiance: np.ndarray,
+    white_sigma: float = WHITE_SIGMA,
+    locus: SkinLocus | None = None,
+    relative_light: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The priors as residuals A u - b of unit variance in u = log mean irradiance [3], given y = log_radiance [3].
 
+    relative_light [L, 3]: log irradiance of several lights relative to u; each is expected to be white by itself.
     Luminance enters linearised: d log Y = sum_c share_c d log a_c, with the shares of a typical skin.
     """
     locus = locus or fit_skin_locus()
@@ -109,7 +113,9 @@ def scale_prior(
     rows, targets, sigmas = np.array(rows), np.array(targets), np.array(sigmas)
     on_skin = -rows / sigmas[:, None]
     right = (targets - rows @ log_radiance) / sigmas
-    return np.concatenate([on_skin, ratio / white_sigma]), np.concatenate([right, np.zeros(2)])
+    relative = np.zeros((1, 3)) if relative_light is None else relative_light
+    white = [ratio / white_sigma] * len(relative)
+    return np.concatenate([on_skin, *white]), np.concatenate([right, (-relative @ ratio.T).ravel() / white_sigma])
 
 
 def most_likely_irradiance(log_radiance: np.ndarray, white_sigma: float = WHITE_SIGMA) -> np.ndarray:
@@ -125,17 +131,19 @@ def settle_scale(
     specular_prior: tuple[float, float],
     white_sigma: float = WHITE_SIGMA,
     chart: tuple[np.ndarray, np.ndarray] | None = None,
+    relative_light: np.ndarray | None = None,
 ) -> tuple[np.ndarray, float]:
     """The factor on the light per channel and the specular intensity that are jointly most likely.
 
     The lobe returns the light's own colour and its strength has a known range, so highlights say something about the
     scale that diffuse skin cannot: with the light multiplied by k, channel c wants s k_c = t_c. log_albedo,
     log_irradiance [3] are the skin's present means; specular_prior: mean of s and standard deviation of its logarithm;
-    chart: the log factor [3] on the light that a colour chart asks for, and its covariance [3, 3]. With a chart the
-    highlights give s alone: on the scale their range has little to add, and the model's errors pass for highlights.
+    chart: the log factor [3] on the light that a colour chart asks for, and its covariance [3, 3]; relative_light: see
+    scale_prior. With a chart the highlights give s alone: on the scale their range has little to add, and the model's
+    errors pass for highlights.
     -> log k [3], and s, the prior's mean without highlights.
     """
-    matrix, right = scale_prior(log_albedo + log_irradiance, white_sigma)
+    matrix, right = scale_prior(log_albedo + log_irradiance, white_sigma, relative_light=relative_light)
     if chart is not None:
         whitening = np.linalg.inv(np.linalg.cholesky(chart[1]))
         matrix = np.concatenate([matrix, whitening])

@@ -81,8 +81,8 @@ class Reflectance:
 
 @dataclass(frozen=True)
 class ShapeClip:
-    """picture(f) of F frames, camera_from_head [F, 4, 4], intrinsics, fitted [F] bool, what moves against the light,
-    and the track points, where there are any."""
+    """picture(f) of F frames, camera_from_head [F, 4, 4], intrinsics [3, 3] or [F, 3, 3], fitted [F] bool, what moves
+    against the light, the track points, where there are any, and each frame's light, None: there is one."""
 
     picture: Callable
     camera_from_head: np.ndarray
@@ -90,6 +90,7 @@ class ShapeClip:
     fitted: np.ndarray
     moves: str
     tracks: TrackPoints | None = None
+    light_index: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -190,6 +191,7 @@ class ShapeSolver:
             self.clip.camera_from_head,
             self.clip.moves,
             bounce=self.appearance.bounce,
+            light_index=self.clip.light_index,
         )
 
     def step(self, surface: Surface, start: np.ndarray, shaped: np.ndarray, held: np.ndarray) -> np.ndarray:
@@ -243,7 +245,7 @@ class ShapeSolver:
 
 def pixels_per_mm(clip: ShapeClip) -> float:
     """At the head's distance in the middle of the clip's frames."""
-    return float(clip.intrinsics[0, 0] / np.median(clip.camera_from_head[:, 2, 3]))
+    return float(np.median(clip.intrinsics[..., 0, 0]) / np.median(clip.camera_from_head[:, 2, 3]))
 
 
 def typical_edge(vertices: np.ndarray, faces: np.ndarray) -> float:

@@ -75,24 +75,26 @@ def gather_surface(
 ) -> SurfaceSamples:
     """Samples of the vertices index [P] in F frames.
 
-    pictures: F, read once in order; camera_from_head [F, 4, 4]; blur_mm: standard width of the blur on the surface.
+    pictures: F, read once in order; camera_from_head [F, 4, 4]; intrinsics [3, 3] or [F, 3, 3]; blur_mm: standard
+    width of the blur on the surface.
     """
     shape = (len(index), len(camera_from_head))
+    intrinsics = np.broadcast_to(intrinsics, (len(camera_from_head), 3, 3))
     colours, limits = np.zeros(shape + (3,), np.float32), np.zeros(shape + (3,), np.int8)
     gradient = np.zeros(shape + (3, 2), np.float16)
     slope, weight = np.zeros(shape + (2, 3), np.float32), np.zeros(shape, np.float32)
     for f, picture in enumerate(pictures):
-        pose = camera_from_head[f]
-        view = viewer.view(pose, intrinsics, picture.inside.shape[::-1])
+        pose, lens = camera_from_head[f], intrinsics[f]
+        view = viewer.view(pose, lens, picture.inside.shape[::-1])
         seen = np.nonzero(view.weight[index] > 0)[0]
         if len(seen) == 0:
             continue
         pixels = view.pixels[index[seen]]
-        sigma = blur_mm * float(intrinsics[0, 0]) / float(np.median(view.depth[index[seen]]))
+        sigma = blur_mm * float(lens[0, 0]) / float(np.median(view.depth[index[seen]]))
         colour, along_x, along_y = (remap(image, pixels) for image in picture_and_gradient(picture, sigma))
         colours[seen, f] = np.maximum(colour, 0.0)
         gradient[seen, f] = np.stack([along_x, along_y], axis=-1)
-        slope[seen, f] = projection_slope(viewer.mesh.vertices[index[seen]], pose, intrinsics)
+        slope[seen, f] = projection_slope(viewer.mesh.vertices[index[seen]], pose, lens)
         limits[seen, f] = sample_limits(picture, pixels)
         weight[seen, f] = view.weight[index[seen]] * sample_inside(picture, pixels)
     return SurfaceSamples(colours, gradient, slope, weight, limits)

@@ -11,6 +11,7 @@ eliminated) are summed over a neighbourhood on the map before they are solved. H
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,9 +98,48 @@ class NormalEquations:
         small error makes a large albedo: typical_albedo [3] bounds what counts; systematic [T, 3]: variance that all
         frames share.
         """
-        albedo = np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)
+        albedo = self._bounded_albedo(typical_albedo)
         spared = self.measured_ee / np.maximum(self.measured_ee + self.clipped_ee, 1e-9)
         return 1.0 / (systematic + CORRELATED_FRAMES / np.maximum(spared**2 * self.measured_ee * albedo**2, 1e-9))
+
+    def _bounded_albedo(self, typical_albedo: np.ndarray) -> np.ndarray:
+        return np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)
+
+    def trusted_share(self, typical_albedo: np.ndarray, systematic: np.ndarray) -> np.ndarray:
+        """[T, 3]: how much of their weight errors that all frames share leave to the equations, among those of other
+        lights."""
+        precision = self.ee * np.square(self._bounded_albedo(typical_albedo)) / CORRELATED_FRAMES
+        return 1.0 / (1.0 + precision * systematic)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the frames of all lights say: equations, information [T, 3] on the log albedo, and systematic [T, 3]: the
+    variance that is left however many frames there are."""
+
+    equations: NormalEquations
+    information: np.ndarray
+    systematic: np.ndarray
+
+
+def weigh_lights(
+    parts: Sequence[NormalEquations], systematic: Sequence[np.ndarray], typical_albedo: np.ndarray
+) -> Evidence:
+    """The equations of each light with the variance [T, 3] that its frames share -> of all lights together.
+
+    Where one light grazes or hardly reaches a texel another one decides: two lights' errors have nothing in common.
+    """
+    information = sum(own.information(typical_albedo, error) for own, error in zip(parts, systematic, strict=True))
+    if len(parts) == 1:
+        return Evidence(parts[0], information, systematic[0])
+    whole = NormalEquations(len(information), parts[0].noise)
+    left = np.zeros_like(information)
+    for own, error in zip(parts, systematic, strict=True):
+        share = own.trusted_share(typical_albedo, error)
+        whole.sums += own.sums * np.tile(share, 6)
+        whole.clipped_ee += own.clipped_ee * share
+        left += np.square(own.ee * share) * error
+    return Evidence(whole, information, left / np.maximum(np.square(whole.ee), 1e-12))
 
 
 @compiled

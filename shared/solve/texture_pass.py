@@ -10,16 +10,19 @@ import numpy as np
 from shared.gather import Picture, SurfaceViewer, satisfied
 from shared.read_ahead import read_ahead
 from shared.shading import VertexShading
+from shared.solve.appearance import frames_of_lights
 from shared.solve.capture import spread_frames
 from shared.solve.texture import (
     IRRADIANCE_ERROR,
     NORMAL_ERROR,
     PRIOR_SPREAD,
+    Evidence,
     Noise,
     NormalEquations,
     TexelMaterial,
     pooled_specular,
     robust_weight,
+    weigh_lights,
 )
 from shared.texels import TexelSamples, TexelSurface, smooth_field
 
@@ -33,12 +36,13 @@ FIRST_PASS_FRAMES = 32
 @dataclass(frozen=True)
 class Clip:
     """The frames as the pass reads them: picture(f) for f in range(F), poses [F, 4, 4], intrinsics of the pictures,
-    fitted [F] bool; the others are held out."""
+    [3, 3] or [F, 3, 3], fitted [F] bool; the others are held out; light_index [F]: each frame's light, None: one."""
 
     picture: Callable[[int], Picture]
     camera_from_head: np.ndarray
     intrinsics: np.ndarray
     fitted: np.ndarray
+    light_index: np.ndarray | None = None
 
 
 class TexturePass:
@@ -61,57 +65,67 @@ class TexturePass:
     ):
         self.surface, self.viewer, self.shading, self.clip = surface, viewer, shading, clip
         self.typical_albedo = typical_albedo
-        mean = np.maximum(surface.interpolate(shading.mean_irradiance()), 1e-6)
-        turned = NORMAL_ERROR * surface.interpolate(shading.mean_slope()) / mean
-        self.systematic = np.square(IRRADIANCE_ERROR * np.median(mean, axis=0) / mean) + np.square(turned)
+        self.intrinsics = np.broadcast_to(clip.intrinsics, (len(clip.fitted), 3, 3))
+        self.light_index = np.zeros(len(clip.fitted), int) if clip.light_index is None else clip.light_index
+        lights = frames_of_lights(self.light_index, len(clip.fitted))
+        self.systematic = [self._systematic(frames) for frames in lights]
         self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), progress
+
+    def _systematic(self, frames: np.ndarray) -> np.ndarray:
+        """[T, 3]: variance of the log albedo that all frames of one light share."""
+        surface, shading = self.surface, self.shading
+        mean = np.maximum(surface.interpolate(shading.mean_irradiance(frames)), 1e-6)
+        turned = NORMAL_ERROR * surface.interpolate(shading.mean_slope(frames)) / mean
+        return np.square(IRRADIANCE_ERROR * np.median(mean, axis=0) / mean) + np.square(turned)
 
     def run(self, widths: tuple[float, ...]) -> tuple[TexelMaterial, dict]:
         """Both passes -> the material, and a record of what the held-out frames said to each pooling width."""
         count = len(self.surface)
         mean = np.full(count, self.specular, np.float32)
         fitted = np.nonzero(self.clip.fitted)[0]
-        some = fitted[spread_frames(len(fitted), FIRST_PASS_FRAMES)]
+        some = fitted[spread_frames(len(fitted), FIRST_PASS_FRAMES, self.light_index[fitted])]
         (first,) = self._close(self._accumulate(None, some, "texture, first pass"), [mean])
-        equations = self._accumulate(first, fitted, "texture, second pass")
-        pooled = [pooled_specular(self.surface, equations, width, self.specular, self.sigma) for width in widths]
-        candidates = self._close(equations, pooled)
+        evidence = self._accumulate(first, fitted, "texture, second pass")
+        prior = self.specular, self.sigma
+        pooled = [pooled_specular(self.surface, evidence.equations, width, *prior) for width in widths]
+        candidates = self._close(evidence, pooled)
         errors = self.held_out_errors(candidates)
         best = int(np.argmin(errors))
         names = ["one value" if not np.isfinite(width) else f"{width:g} texels" for width in widths]
         record = {"held_out": dict(zip(names, errors, strict=True)), "chosen": names[best]}
         return candidates[best], record
 
-    def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> NormalEquations:
-        equations = NormalEquations(len(self.surface), self.noise)
-        for samples, irradiance, reflection in read_ahead(self.frame, self.progress(frames, label)):
+    def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> Evidence:
+        parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]
+        ahead = read_ahead(self.frame, self.progress(frames, label))
+        for f, (samples, irradiance, reflection) in zip(frames, ahead, strict=True):
             if material is None:
                 robust = (samples.limits == 0).astype(np.float32)
             else:
                 model = _model(material, samples, irradiance, reflection)
                 robust = robust_weight(model, samples, self.noise, material.information[samples.rows])
-            equations.add(samples, irradiance, reflection, robust)
-        return equations
+            parts[self.light_index[f]].add(samples, irradiance, reflection, robust)
+        return weigh_lights(parts, self.systematic, self.typical_albedo)
 
     def frame(self, f: int) -> tuple[TexelSamples, np.ndarray, np.ndarray]:
         """Samples of one frame with E and S [n, 3] at them."""
         clip = self.clip
-        pose, picture = clip.camera_from_head[f], clip.picture(f)
-        view = self.viewer.view(pose, clip.intrinsics, picture.inside.shape[::-1])
+        pose, picture, lens = clip.camera_from_head[f], clip.picture(f), self.intrinsics[f]
+        view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
         both = np.concatenate([self.shading.irradiance(f), self.shading.reflection(f)], axis=1)
-        samples, both = self.surface.samples(view, picture, clip.intrinsics, both)
+        samples, both = self.surface.samples(view, picture, lens, both)
         return samples, both[:, :3], both[:, 3:]
 
-    def _close(self, equations: NormalEquations, intensities: list[np.ndarray]) -> list[TexelMaterial]:
+    def _close(self, evidence: Evidence, intensities: list[np.ndarray]) -> list[TexelMaterial]:
         """Albedo for each of some given intensities [T]; channels left open by the samples follow the others and the
         neighbourhood."""
-        information = equations.information(self.typical_albedo, self.systematic)
+        equations, information, systematic = evidence.equations, evidence.information, evidence.systematic
         nothing = np.zeros_like(equations.ee)
         rough = np.stack([equations.solve_albedo(specular, nothing, 1e-6) for specular in intensities], axis=2)
         around = self._surroundings(rough, information).astype(np.float32)
         certain = information / (1.0 + information)
-        trusted = (PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + self.systematic)).mean(1)
-        pull = _ALBEDO_PULL + equations.ee * (self.systematic / PRIOR_SPREAD**2)
+        trusted = (PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + systematic)).mean(1)
+        pull = _ALBEDO_PULL + equations.ee * (systematic / PRIOR_SPREAD**2)
         found = []
         for k, specular in enumerate(intensities):
             smooth = np.exp(self.surface.interpolate(around[..., k]))
