@@ -193,9 +193,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     os.environ.setdefault(peer_mitsuba.VARIABLE, VARIANT)
     try:
-        inputs, frames, index = read_inputs(*(options.run / "work" / name for name in STAGES))
+        inputs = read_inputs(*(options.run / "work" / name for name in STAGES))
         viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
-        some = spread_frames(len(index), START_FRAMES)
+        some = spread_frames(len(inputs.frame_index), START_FRAMES)
         average = average_texture(inputs, viewer, MAP_SIZE, some, lambda items, label="": items)
         start = make_start(average, segment_vertices(inputs, FACE_SKIN), WHITE_SIGMA, specular=True)
         solver = PeerSolver(inputs, start, options.samples, options.scale, options.depth)
@@ -205,7 +205,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     def write(at: float, seconds: float, cpu: float) -> None:
         folder = options.out / f"{at:g}"
-        write_result(folder, solver, index, frames.intrinsics_source)
+        write_result(folder, solver, inputs.frame_index, inputs.frames.intrinsics_source)
         write_json(folder / "cost.json", {"wall_s": seconds, "cpu_s": cpu, "peak_mb": own_peak_bytes() / 2**20})
 
     descend(solver, options.at, began, write)

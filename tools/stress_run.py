@@ -88,9 +88,10 @@ def scores_of(subject: Path, run: RunFolder) -> dict[str, float]:
     """The scores of stress_judge.LIMITS, those of confident texels, and some that are shown only."""
     export = run.root / "export"
     found = score(subject, export)
-    inputs, _, index = read_inputs(run.published("sample_frames"), run.published("track_landmarks"))
+    inputs = read_inputs(run.published("sample_frames"), run.published("track_landmarks"))
     maps = {path.stem: read_exr(path) for path in (export / "maps").glob("*.exr")}
-    errors = map_errors(subject, inputs, index, load_mesh(run.published("inverse_render") / "mesh.npz"), maps)
+    mesh = load_mesh(run.published("inverse_render") / "mesh.npz")
+    errors = map_errors(subject, inputs, inputs.frame_index, mesh, maps)
     return {
         "albedo": errors["delta_e2000_median"],
         "albedo_p90": errors["delta_e2000_p90"],
