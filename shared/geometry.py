@@ -8,6 +8,8 @@ References: Umeyama, Least-squares estimation of transformation parameters betwe
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -90,6 +92,29 @@ def similarity_from_points(
     rotation = u * signs @ vt
     scale = float((singular * signs).sum() / (w[:, None] * a**2).sum()) if with_scale else 1.0
     return scale, rotation, mean_target - scale * rotation @ mean_source
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x_target = scale * rotation @ x_source + translation."""
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """[N, 3] source -> [N, 3] target."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def inverse_points(self, points: np.ndarray) -> np.ndarray:
+        """[N, 3] target -> [N, 3] source."""
+        return (points - self.translation) @ self.rotation / self.scale
+
+    def pose(self, camera_from_source: np.ndarray) -> np.ndarray:
+        """[..., 4, 4] rigid camera_from_source in source units -> camera_from_target in target units: the camera's
+        space grows with the source's, so that pictures stay what they are."""
+        rotation = camera_from_source[..., :3, :3] @ self.rotation.T
+        return rigid(rotation, self.scale * camera_from_source[..., :3, 3] - rotation @ self.translation)
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:

@@ -2,9 +2,10 @@
 
 Reads    sample_frames: frames.json and the frames (for the plates and the report). track_landmarks: tracking.json
          and overlay.png. init_albedo: its record. inverse_render: maps, envmap.exr, mesh.npz, poses.npz, renders,
-         solve.json. Of all of them manifest.json and provenance.json.
-Writes   head.usda with its payload, head.usdz, head.glb, mesh.obj, maps/*.exr, envmap.exr, poses.npz, plates/*.jpg,
-         renders/*.exr, views/*.exr, run.json, report.html.
+         solve.json. Of all of them manifest.json and provenance.json. Of several clips the first is exported, and the
+         light of each.
+Writes   head.usda with its payload, head.usdz, head.glb, mesh.obj, maps/*.exr, envmap.exr, envmaps/*.exr, poses.npz,
+         plates/*.jpg, renders/*.exr, views/*.exr, run.json, report.html.
 Method   Units, axes, colour spaces and sources are stated on everything that is written; then the asset is validated
          as a stranger would find it on disk.
 Fails    values that are not finite, a mesh with broken indices or UVs, a map that is not a square power of two,
@@ -37,6 +38,8 @@ STAGE = Stage(
         Output("maps/*.exr", "texture maps, v up", space="uv", colour_space="in each file"),
         Output("maps/png/*.png", "integer copies of the maps; absent unless png_copies", space="uv", optional=True),
         Output("envmap.exr", "the light, lat-long", space="world", colour_space="in the file"),
+        Output("envmaps/*.exr", "the light of each clip, where there are several", space="world",
+               colour_space="in the file", optional=True),
         Output("poses.npz", "camera_from_head [F, 4, 4], frame_index [F], intrinsics [3, 3] of the frame", "mm"),
         Output("plates/*.jpg", "the clip's crops, sRGB; absent when plates is off", space="crop", optional=True),
         Output("renders/*.exr", "re-renders in full source frames", colour_space="in each file"),
@@ -190,22 +193,49 @@ def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, frames
     return views
 
 
+def other_clips(job: Job, solve: dict) -> list:
+    """ClipResult of all clips but the first."""
+    from shared.io.arrays import load_arrays
+    from shared.io.frames import FrameSet
+    from shared.io.images import read_exr
+    from shared.report.build import ClipResult
+
+    results = []
+    for clip in solve.get("clips", ())[1:]:
+        name = clip["name"]
+        solved = job.input("inverse_render") / "clips" / name
+        folders = {stage: job.input(stage, name) for stage in STAGE.joins}
+        poses, frames = load_arrays(solved / "poses.npz"), FrameSet.open(folders["sample_frames"])
+        results.append(ClipResult(name, folders, solved, frames, poses, read_exr(solved / "envmap.exr"), clip))
+    return results
+
+
+def write_lights(job: Job, writer, envmap, clips: list) -> None:
+    """envmaps/: the light of each clip, where there are several."""
+    if clips:
+        (job.out / "envmaps").mkdir()
+        lights = zip(job.clips, [envmap, *(clip.envmap for clip in clips)], strict=True)
+        for name, light in lights:
+            writer.write_colour(job.out / "envmaps" / f"{name}.exr", light, "radiance, clip maximum 1", latlong=True)
+
+
 def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     """The content of run.json: what each stage was told, what it took, what it found."""
     from shared.mesh_checks import mesh_warnings
     from shared.report.gather import own_record, stage_record, warnings_of
 
     records, warnings = {}, []
-    for stage in STAGE.inputs:
-        records[stage] = stage_record(job.manifest(stage), job.provenance(stage))
-        warnings += warnings_of(stage, job.input(stage), records[stage])
+    for name in job.input_names:
+        clip, _, stage = name.rpartition("/")
+        records[name] = stage_record(job.manifest(stage, clip), job.provenance(stage, clip))
+        warnings += [(name, text) for _, text in warnings_of(stage, job.input(stage, clip), records[name])]
     own = own_record(STAGE.version, job.params.as_dict(), own_seconds)
     for text in mesh_warnings(mesh):
         job.warn(text)
         own["warnings"].append(text)
         warnings.append((STAGE.name, text))
     records[STAGE.name] = own
-    kept = ("model", "ladder", "residuals", "albedo_scale", "held_out_frames")
+    kept = ("model", "ladder", "residuals", "albedo_scale", "held_out_frames", "clips")
     chosen = {key: solve[key] for key in kept if key in solve}
     return {
         "subject": job.subject.name,
@@ -232,6 +262,8 @@ def run(job: Job) -> None:
     params = job.params
     writer = MapWriter(params.map_format == "half", params.acescg, source, params.map_layout, params.udim)
     write_images(job, writer, maps, envmap, frames, solve["render_frames"])
+    clips = other_clips(job, solve)
+    write_lights(job, writer, envmap, clips)
     asset = describe_asset(job, mesh, describe_capture(job, poses, frames), frames, writer)
     write_assets(job, asset, poses, maps, envmap)
     views = render_views(job, writer, mesh, maps, envmap, poses, frames, solve)
@@ -239,7 +271,7 @@ def run(job: Job) -> None:
     write_json(job.out / "run.json", record)
     folders = {name: job.input(name) for name in STAGE.inputs}
     files = [(output.path, output.help) for output in STAGE.outputs]
-    result = Result(job.subject.name, folders, frames, mesh, poses, maps, envmap, solve, record, files, views)
+    result = Result(job.subject.name, folders, frames, mesh, poses, maps, envmap, solve, record, files, views, clips)
     page = result_report(result, job.params.report_frames)
     (job.out / "report.html").write_text(page, encoding="utf-8")
 

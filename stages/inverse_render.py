@@ -1,14 +1,15 @@
 """Inverse rendering: light, shape, and the skin's albedo, specular intensity and roughness, from the whole clip.
 
-Reads    sample_frames (frames, masks), track_landmarks (poses, mesh, segments, track points).
+Reads    sample_frames (frames, masks), track_landmarks (poses, mesh, segments, track points), and of several clips
+         init_albedo (mean textures).
 Writes   maps/*.exr, envmap.exr, mesh.npz, poses.npz, renders/*.exr, solve.json.
 Method   In head space a surface point's view of the sphere never changes, so visibility and bounces are traced once
          and reused by all frames. Light by Gauss-Newton with the albedo eliminated, specular intensity in closed form,
          roughness by line search, stopping on held-out frames. Under that light the mesh is refined from parallax and
          shading by Gauss-Newton, coarse to fine, the light solved anew, and the refined mesh kept if held-out frames
          fit better. Then albedo and specular intensity per texel in closed form, streaming over the frames. The solver
-         starts from a uniform light and the priors: it needs no start from init_albedo, which is an input for
-         comparison only.
+         starts from a uniform light and the priors: of one clip it needs no start from init_albedo, which is an input
+         for comparison only.
          Or (solver=reference) as published: shared/solve/reference.py.
          Several clips of one head under different lights are solved as one (shared/solve/joint_clips.py): one mesh and
          one set of maps, a light and poses of each. What lies at the top is the first clip's then, and clips/ holds
@@ -253,13 +254,19 @@ def run(job: Job) -> None:
     import numpy as np
 
     from shared.io.arrays import write_json
+    from shared.io.clip_inputs import read_mean_texture
     from shared.io.meshes import save_mesh
     from shared.solve.inverse import solve_clip, summarise
     from shared.solve.joint_clips import join_clips
     from shared.solve.reshape import segments_of
 
     clips = read_clips(job)
-    inputs = join_clips(clips) if job.clips else clips[0]
+    inputs = clips[0]
+    if job.clips:
+        textures = [read_mean_texture(job.input("init_albedo", name), clip.mesh)
+                    for name, clip in zip(job.clips, clips, strict=True)]
+        inputs = join_clips(clips, textures)
+        job.note(f"clips in one head space: {inputs.describe()}")
     sights = inputs.chart_sights() if job.params.chart else ()
     settings = read_settings(job, job.out.parent / CHECKPOINT)
     result = solve_clip(inputs, settings, job.progress, job.note, sights)

@@ -125,18 +125,19 @@ class ToyJob:
         self.params = Parameters(STAGE.defaults() | {"view_size": VIEW_SIZE} | parameters)
         self.subject = SimpleNamespace(name=name, sensor_width_mm=22.3, focal_length_mm=None)
         self.out, self._work, self.warnings = out, work, []
+        self.clips, self.input_names = (), STAGE.inputs
 
-    def input(self, stage: str) -> Path:
+    def input(self, stage: str, clip: str = "") -> Path:
         """The folder of a stage before this one."""
         return self._work / stage
 
-    def manifest(self, stage: str) -> dict:
+    def manifest(self, stage: str, clip: str = "") -> dict:
         """What the stage was told."""
-        return json.loads((self.input(stage) / "manifest.json").read_text())
+        return json.loads((self.input(stage, clip) / "manifest.json").read_text())
 
-    def provenance(self, stage: str) -> dict:
+    def provenance(self, stage: str, clip: str = "") -> dict:
         """What the stage took."""
-        return json.loads((self.input(stage) / "provenance.json").read_text())
+        return json.loads((self.input(stage, clip) / "provenance.json").read_text())
 
     def progress(self, iterable, label, total=None):
         """The items, silently."""

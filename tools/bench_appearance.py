@@ -31,7 +31,7 @@ from shared.contract.job import Parameters
 from shared.envmap import latlong_from_cube
 from shared.gather import Picture, prepare_picture
 from shared.io.arrays import load_arrays
-from shared.io.clip_inputs import ClipInputs, read_inputs
+from shared.io.clip_inputs import ClipInputs, read_inputs, read_mean_texture
 from shared.io.images import read_exr, read_png
 from shared.io.meshes import read_obj
 from shared.mesh import Mesh, interpolate
@@ -40,6 +40,7 @@ from shared.render import SurfaceMaps, render_frame
 from shared.solve.inverse import InverseResult, solve_clip
 from shared.solve.joint_clips import join_clips
 from shared.texture import sample_bilinear
+from shared.texture_match import MeanTexture
 from stages.inverse_render import STAGE, read_settings
 from tools import score_measures
 from tools.bench_relight import relight_errors
@@ -198,7 +199,12 @@ def render_errors(subject: Path, inputs: ClipInputs, result: InverseResult) -> d
 
 
 def measure(
-    subject: Path, clips: Sequence[ClipInputs], index: np.ndarray, changes: dict, note: Callable
+    subject: Path,
+    clips: Sequence[ClipInputs],
+    index: np.ndarray,
+    changes: dict,
+    note: Callable,
+    textures: Sequence[MeanTexture] = (),
 ) -> tuple[dict, object]:
     """Solves one case and compares it with the first clip's truth -> scores and the result; index [F]: its frames."""
     start = time.perf_counter()
@@ -206,9 +212,9 @@ def measure(
     inputs, sights = clips[0], clips[0].chart_sights() if job.params.chart else ()
     together = inputs
     if len(clips) > 1:
-        together = join_clips(clips)
+        together = join_clips(clips, textures)
         inputs = replace(inputs, camera_from_head=together.camera_from_head[: len(index)])
-        note(f"mesh of clip {together.main}; track points of the clips lie {together.placed_mm} mm from it")
+        note(f"clips in one head space: {together.describe()}")
     result = solve_clip(together, read_settings(job), silent, note, sights)
     scores = {"seconds": time.perf_counter() - start}
     scores["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
@@ -276,13 +282,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--cost", action="store_true", help="times over sizes instead of accuracy")
     options = parser.parse_args(arguments)
     inputs, index = open_clip(options.subject, options.run, options.tracked)
-    clips = [inputs, *([open_clip(*options.other, options.tracked)[0]] if options.other else [])]
+    clips, textures = [inputs], []
+    if options.other:
+        clips.append(open_clip(*options.other, options.tracked)[0])
+        runs = options.run, options.other[1]
+        textures = [read_mean_texture(run / "work" / "init_albedo", clip.mesh)
+                    for run, clip in zip(runs, clips, strict=True) if options.tracked]
     given = dict(setting.split("=", 1) for setting in options.set)
     if options.cost:
         cost_table(inputs, given)
         return 0
     for case in options.cases:
-        scores, result = measure(options.subject, clips, index, {**given, **CASES[case]}, print)
+        scores, result = measure(options.subject, clips, index, {**given, **CASES[case]}, print, textures)
         rounded = {key: round(value, 4) if isinstance(value, float) else value for key, value in scores.items()}
         print(case, json.dumps(rounded))
         if options.out:

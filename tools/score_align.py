@@ -7,12 +7,10 @@ gives the final one. Arrays in, arrays out.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial import cKDTree
 
-from shared.geometry import camera_centres, rotation_from_vector, similarity_from_points
+from shared.geometry import Similarity, camera_centres, rotation_from_vector, similarity_from_points
 from shared.mesh import Mesh, vertex_normals
 from shared.texture import sample_bilinear
 
@@ -20,30 +18,6 @@ FACE_SAMPLES = 20_000
 SURFACE_SAMPLES = 600_000
 FACE_MARGIN_MM = 40.0
 POINT_TO_POINT_WEIGHT = 0.03
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """x_target = scale * rotation @ x_source + translation."""
-
-    scale: float
-    rotation: np.ndarray
-    translation: np.ndarray
-
-    def points(self, points: np.ndarray) -> np.ndarray:
-        """[N,3] source -> [N,3] target."""
-        return self.scale * points @ self.rotation.T + self.translation
-
-    def inverse_points(self, points: np.ndarray) -> np.ndarray:
-        """[N,3] target -> [N,3] source."""
-        return (points - self.translation) @ self.rotation / self.scale
-
-    def pose(self, camera_from_source: np.ndarray) -> np.ndarray:
-        """[4,4] rigid camera_from_source in source units -> camera_from_target in target units."""
-        pose = np.eye(4)
-        pose[:3, :3] = camera_from_source[:3, :3] @ self.rotation.T
-        pose[:3, 3] = self.scale * camera_from_source[:3, 3] - pose[:3, :3] @ self.translation
-        return pose
 
 
 def sample_surface(

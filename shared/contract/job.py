@@ -53,6 +53,11 @@ class Job:
         """Names of the clips that the stage joins; empty where there is but one."""
         return tuple(clip.name for clip in self.subject.clips)
 
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """The inputs' names as in the manifest: stage, or clip/stage."""
+        return tuple(self._folders)
+
     def input(self, stage: str, clip: str = "") -> Path:
         """The published folder of a declared input; clip: of which clip, the first one's by default."""
         of_clip = f"{clip or next(iter(self.clips), '')}/{stage}"

@@ -13,8 +13,10 @@ from shared.errors import InputError
 from shared.gather import Picture, prepare_picture
 from shared.io.arrays import load_arrays, read_json
 from shared.io.frames import FrameSet
+from shared.io.images import read_exr
 from shared.io.meshes import load_mesh, read_obj
 from shared.mesh import Mesh
+from shared.texture_match import MeanTexture
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,11 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
     tracks = None if points is None else (points["points_head"], points["residual_px"])
     pose, place = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
     return ClipInputs(mesh, pose, frames.intrinsics, frames.size, frames.moves, frames, place, segment, names, tracks)
+
+
+def read_mean_texture(folder: Path, mesh: Mesh) -> MeanTexture:
+    """What init_albedo averaged on a mesh, from its folder."""
+    return MeanTexture(mesh, read_exr(folder / "mean_texture.exr"), read_exr(folder / "weight.exr"))
 
 
 def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.ndarray]:

@@ -12,11 +12,27 @@ from shared.io.export_maps import SOLVED_MAPS
 from shared.io.frames import FrameSet
 from shared.io.images import read_png
 from shared.mesh import Mesh
-from shared.report.content import Cost, ReportContent
+from shared.report.content import ClipContent, Cost, ReportContent
 from shared.report.gather import chosen_frames, compared_frames, excluded_frames, motion
 from shared.report.page import report_html
 from shared.report.sections import number
 from shared.view_set import ViewSet
+
+FRAMES_OF_OTHER_CLIPS = 3
+
+
+@dataclass(frozen=True)
+class ClipResult:
+    """Another clip that the head was solved from. folders {stage: folder} of its own stages; solved: folder of its
+    light, poses and re-renders; solve: what solve.json says of it."""
+
+    name: str
+    folders: Mapping[str, Path]
+    solved: Path
+    frames: FrameSet
+    poses: Mapping[str, np.ndarray]
+    envmap: np.ndarray
+    solve: Mapping[str, object]
 
 
 @dataclass(frozen=True)
@@ -24,7 +40,7 @@ class Result:
     """What the export holds in memory while it writes: the report's raw material.
 
     folders {stage: folder} of the stages before it; record: the content of run.json; files: (name, text) pairs; views:
-    None when they were not wished.
+    None when they were not wished; clips: all but the first, where there are several.
     """
 
     name: str
@@ -38,6 +54,7 @@ class Result:
     record: Mapping[str, object]
     files: Sequence[tuple[str, str]]
     views: ViewSet | None = None
+    clips: Sequence[ClipResult] = ()
 
 
 def result_report(result: Result, frame_count: int) -> str:
@@ -73,8 +90,25 @@ def result_report(result: Result, frame_count: int) -> str:
         warnings=[(row["stage"], row["text"]) for row in record["warnings"]],
         parameters=_parameters(record),
         files=result.files,
+        clips=[_clip(clip) for clip in result.clips],
     )
     return report_html(content)
+
+
+def _clip(clip: ClipResult) -> ClipContent:
+    frames, poses, held_out = clip.frames, clip.poses, clip.solve["held_out_frames"]
+    angles, position = motion(poses["camera_from_head"], frames.moves)
+    chosen = chosen_frames(clip.solve["render_frames"], held_out, FRAMES_OF_OTHER_CLIPS)
+    return ClipContent(
+        name=clip.name,
+        facts=_facts(frames, float(poses["intrinsics"][0, 0])),
+        frames=compared_frames(frames, clip.solved / "renders", chosen, held_out),
+        envmap=clip.envmap,
+        frame_index=poses["frame_index"],
+        angles_deg=angles,
+        position_mm=position,
+        excluded=excluded_frames(clip.folders["sample_frames"], clip.folders["track_landmarks"]),
+    )
 
 
 def _facts(frames: FrameSet, focal_px: float) -> list[tuple[str, str]]:

@@ -37,6 +37,20 @@ class Cost:
 
 
 @dataclass(frozen=True)
+class ClipContent:
+    """Another clip that the head was solved from, in a light of its own; fields as in ReportContent."""
+
+    name: str
+    facts: Sequence[tuple[str, str]]
+    frames: Iterable[Frame]
+    envmap: np.ndarray
+    frame_index: np.ndarray
+    angles_deg: np.ndarray
+    position_mm: np.ndarray
+    excluded: Sequence[tuple[int, str, str]] = ()
+
+
+@dataclass(frozen=True)
 class ReportContent:
     """One subject's result.
 
@@ -44,7 +58,7 @@ class ReportContent:
     angles_deg [F, 3] yaw, pitch, roll and position_mm [F, 3] at frame_index [F]. excluded: (frame, stage, reason).
     views: None when they were not wished. ladder: the models tried, one dictionary each, in order. residuals: nested
     dictionaries of numbers. iterations: one dictionary of numbers each. warnings: (stage, text). parameters: (stage,
-    name, value).
+    name, value). clips: all but the first, where there are several.
     """
 
     name: str
@@ -69,3 +83,4 @@ class ReportContent:
     warnings: Sequence[tuple[str, str]] = ()
     parameters: Sequence[tuple[str, str, object]] = ()
     files: Sequence[tuple[str, str]] = ()
+    clips: Sequence[ClipContent] = ()

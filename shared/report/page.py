@@ -44,6 +44,7 @@ def report_html(content: ReportContent) -> str:
         ("poses", "Motion", sections.pose_section(content)),
         ("tracking", "Tracking", sections.tracking_section(content.overlay)),
         ("excluded", "Frames left out", sections.excluded_section(content.excluded)),
+        *([("clips", "Other clips", sections.clips_section(content.clips))] if content.clips else []),
         ("residuals", "Residuals", model_sections.residual_section(content, frames)),
         ("ladder", "Models tried", model_sections.ladder_section(content)),
         ("cost", "Time and memory", sections.cost_section(content)),

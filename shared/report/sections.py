@@ -10,7 +10,7 @@ import numpy as np
 
 from shared.report.advice import advice
 from shared.report.charts import line_chart
-from shared.report.content import Frame, ReportContent
+from shared.report.content import ClipContent, Frame, ReportContent
 from shared.report.pictures import (
     ERROR_RANGE,
     error_bytes,
@@ -81,11 +81,7 @@ def comparison_section(frames: Sequence[dict]) -> str:
         return "<p>No frame was re-rendered.</p>"
     start = len(frames) // 2
     first = frames[start]
-    pictures = (
-        figure(first["clip"], "frame of the clip", "<b>Clip</b>", element_id="frame-clip")
-        + figure(first["render"], "re-render of the frame", "<b>Re-render</b>", element_id="frame-render")
-        + figure(first["error"], "error map", "<b>Re-render minus clip</b>", element_id="frame-error")
-    )
+    pictures = _triple(first, "frame-")
     slider = (
         f'<div class="slider"><input id="frame" type="range" min="0" max="{len(frames) - 1}" value="{start}" '
         f'aria-label="frame"><output id="frame-label">{escape(first["label"])}</output></div>'
@@ -97,7 +93,31 @@ def comparison_section(frames: Sequence[dict]) -> str:
         "overexposed, a brighter re-render counts as equal. PSNR over the head without its edge and overexposed "
         "pixels.</p>"
     )
-    return f'{slider}<div class="triple">{pictures}</div>{legend}'
+    return f"{slider}{pictures}{legend}"
+
+
+def _triple(frame: dict, element_id: str = "") -> str:
+    """Clip, re-render and error side by side."""
+    texts = {"clip": ("frame of the clip", "Clip"), "render": ("re-render of the frame", "Re-render"),
+             "error": ("error map", "Re-render minus clip")}
+    figures = (figure(frame[key], alt, f"<b>{text}</b>", element_id=f"{element_id}{key}" if element_id else "")
+               for key, (alt, text) in texts.items())
+    return f'<div class="triple">{"".join(figures)}</div>'
+
+
+def clips_section(clips: Sequence[ClipContent]) -> str:
+    """The other clips: some frames beside their re-renders, the light, the motion."""
+    parts = []
+    for clip in clips:
+        facts = ", ".join(f"{escape(label)} {escape(value)}" for label, value in clip.facts)
+        parts.append(f'<h3>{escape(clip.name)}</h3><p class="note">{facts}</p>')
+        for frame in map(comparison_frame, clip.frames):
+            parts.append(f'<p class="note">{escape(frame["label"])}</p>{_triple(frame)}')
+        parts += [light_section(clip.envmap), pose_section(clip)]
+        if clip.excluded:
+            parts.append(f"<details><summary>{len(clip.excluded)} frames left out</summary>"
+                         f"{excluded_section(clip.excluded)}</details>")
+    return "".join(parts)
 
 
 def map_section(maps: Mapping[str, np.ndarray]) -> str:
@@ -148,7 +168,7 @@ def light_section(envmap: np.ndarray, chart: np.ndarray | None = None) -> str:
     return f'<div class="pair">{pictures}</div>{note}'
 
 
-def pose_section(content: ReportContent) -> str:
+def pose_section(content: ReportContent | ClipContent) -> str:
     """Rotation and position over the clip's frames; strokes below mark frames that were left out."""
     angles = dict(zip(("yaw", "pitch", "roll"), content.angles_deg.T, strict=True))
     position = dict(zip(("x", "y", "z"), (content.position_mm - content.position_mm.mean(0)).T, strict=True))

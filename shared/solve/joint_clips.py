@@ -1,10 +1,9 @@
 """Several clips of one head as one: one mesh, poses in one head space, each clip's frames in a light of their own.
 
-Each clip was tracked by itself, so that it has a head space and a size of its own: both follow from the head model's
-prior. The mesh is that of the clip whose tracks know depth best. The track points of the others are laid onto it as
-bodies of free size, point to plane, and their poses follow.
-
-References: Chen and Medioni, Object modelling by registration of multiple range images, 1992.
+Each clip was tracked by itself, so that it has a head space, a size and a shape of its own. The mesh is that of the
+clip whose tracks know depth best. For the others their mean textures say which skin lies where on it: what a frame
+showed at some pixel of its own clip's mesh, the shared mesh has to show there, too, and that is a pose from many named
+points for each frame. Depth that one clip got wrong does not enter: only where its mesh put the skin in the pictures.
 """
 
 from __future__ import annotations
@@ -13,54 +12,30 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from shared.bundle import resect
+from shared.bundle_problem import Tracks
 from shared.chart import ChartSight
+from shared.errors import InputError
 from shared.gather import Picture
-from shared.geometry import rigid, rotation_from_vector, similarity_from_points
-from shared.mesh import Mesh, interpolate, normalised, vertex_normals
-from shared.raycast import RayScene
-from shared.solve.reshape import faces_of, track_points
+from shared.geometry import Similarity, camera_centres, project, similarity_from_points
+from shared.mesh import Mesh, normalised
+from shared.solve.reshape import track_points
+from shared.texture_match import Matches, MeanTexture, match_textures
 
-UNTRACKED = ("eyes", "eye_sockets", "inner_mouth", "scalp")
-"""Segments on which no track point lies."""
-REACH_MM, ITERATIONS, SETTLED_MM = 15.0, 40, 1e-4
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """target ~ scale * rotation @ source + translation: takes one head space to another."""
-
-    scale: float
-    rotation: np.ndarray
-    translation: np.ndarray
-
-    def apply(self, points: np.ndarray) -> np.ndarray:
-        """Points [N, 3]."""
-        return self.scale * points @ self.rotation.T + self.translation
-
-    def after(self, first: Similarity) -> Similarity:
-        """The first one, then this one."""
-        place = self.apply(first.translation[None])[0]
-        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, place)
-
-    def camera_from_target(self, camera_from_source: np.ndarray) -> np.ndarray:
-        """Poses [F, 4, 4] of the source's space -> of the target's. The camera's space grows with the head, so that
-        pictures stay what they are."""
-        rotation = camera_from_source[:, :3, :3] @ self.rotation.T
-        return rigid(rotation, self.scale * camera_from_source[:, :3, 3] - rotation @ self.translation)
-
-
-UNMOVED = Similarity(1.0, np.eye(3), np.zeros(3))
+MATCHES, LEAST_MATCHES = 2000, 300
+"""Texels that a pose is solved from, and fewer than which show that the clips have no skin in common."""
+FACING = 0.4
+"""Cosine of the angle between normal and line of sight from which on a frame shows a texel well."""
+NOISE_PX = 0.5
 
 
 @dataclass(frozen=True)
 class JointInputs:
     """What the solver needs of several clips (see InverseInputs): the frames of each in a row.
 
-    clips: as they are on disk; main: which of them the mesh comes from; sizes [C]: how large each clip's own head space
-    took the head to be, the main one's 1, and placed_mm [C]: median distance of its track points from the mesh, NaN
-    where there are none.
+    clips: as they are on disk; main: which of them the mesh comes from; matched [C]: texels by which each other clip
+    was placed, and match_px [C]: median distance of these from where the clip's own mesh put them.
     """
 
     clips: tuple
@@ -74,8 +49,8 @@ class JointInputs:
     segment_names: tuple[str, ...]
     tracks: tuple[np.ndarray, np.ndarray] | None
     light_index: np.ndarray
-    sizes: tuple[float, ...]
-    placed_mm: tuple[float, ...]
+    matched: tuple[int, ...]
+    match_px: tuple[float, ...]
 
     def picture(self, f: int) -> Picture:
         """Frame f of all."""
@@ -93,90 +68,68 @@ class JointInputs:
         return ()
 
     def describe(self) -> list[dict]:
-        """Of each clip what solve.json says: whether the mesh is its own, and how its track points lie on it."""
-        facts = zip(self.sizes, self.placed_mm, strict=True)
-        return [{"mesh": k == self.main, "size": round(size, 5), "tracks_to_mesh_mm": round(placed, 4)}
-                for k, (size, placed) in enumerate(facts)]
+        """Of each clip what solve.json says: whether the mesh is its own, else how its frames were placed on it."""
+        facts = zip(self.matched, self.match_px, strict=True)
+        return [{"mesh": True} if k == self.main else {"mesh": False, "matched_texels": count, "match_px": round(px, 4)}
+                for k, (count, px) in enumerate(facts)]
 
 
-def join_clips(clips: Sequence) -> JointInputs:
-    """Clips (shared.io.clip_inputs.ClipInputs) in the head space of the one that knows depth best.
+def join_clips(clips: Sequence, textures: Sequence[MeanTexture]) -> JointInputs:
+    """Clips (shared.io.clip_inputs.ClipInputs) in the head space of the one that knows depth best; textures: theirs.
 
-    Clips without tracks, whose mesh and poses were given, share a head space already.
+    Clips without tracks, whose mesh and poses were given, share a head space already. InputError where the clips show
+    no common skin.
     """
-    main, placings, tracks, placed = 0, [UNMOVED] * len(clips), None, [np.nan] * len(clips)
+    main, placed = 0, [Placed(clip.camera_from_head) for clip in clips]
     if all(clip.tracks is not None for clip in clips):
         main = int(np.argmin([depth_deviation(clip) for clip in clips]))
-        surface = TrackedSurface(clips[main])
-        placings = [UNMOVED if clip is clips[main] else surface.lay_on(clip) for clip in clips]
-        points = [placing.apply(clip.tracks[0]) for placing, clip in zip(placings, clips, strict=True)]
-        tracks = np.concatenate(points), np.concatenate([clip.tracks[1] for clip in clips])
-        placed = [float(np.median(np.abs(surface.under(own)[2]))) for own in points]
+        for k, clip in enumerate(clips):
+            if k != main:
+                placed[k] = place(clips[main], clip, match_textures(textures[main], textures[k]))
     counts = [len(clip.camera_from_head) for clip in clips]
-    poses = [placing.camera_from_target(clip.camera_from_head) for placing, clip in zip(placings, clips, strict=True)]
     return JointInputs(
         tuple(clips),
         main,
         clips[main].mesh,
-        np.concatenate(poses),
+        np.concatenate([own.camera_from_head for own in placed]),
         np.repeat([clip.intrinsics for clip in clips], counts, axis=0),
         clips[0].size,
         clips[0].moves,
         clips[main].face_segment,
         clips[main].segment_names,
-        tracks,
+        clips[main].tracks,
         np.repeat(np.arange(len(clips)), counts),
-        tuple(1.0 / placing.scale for placing in placings),
-        tuple(placed),
+        tuple(own.matched for own in placed),
+        tuple(own.match_px for own in placed),
     )
 
 
 def depth_deviation(clip) -> float:
     """Median standard deviation of a clip's track points in depth, mm."""
-    known = track_points(*clip.tracks, clip.camera_from_head, clip.intrinsics)
-    return float(np.median(known.sigma_mm))
+    return float(np.median(track_points(*clip.tracks, clip.camera_from_head, clip.intrinsics).sigma_mm))
 
 
-class TrackedSurface:
-    """Where track points lie on a clip's mesh."""
+@dataclass(frozen=True)
+class Placed:
+    """A clip's poses [F, 4, 4] in the shared head space; matched, match_px: see JointInputs."""
 
-    def __init__(self, clip):
-        self.mesh, self.scene = clip.mesh, RayScene(clip.mesh.vertices, clip.mesh.faces)
-        self.normals = vertex_normals(clip.mesh.vertices, clip.mesh.faces)
-        untracked = np.zeros(len(clip.mesh.faces), bool) if clip.face_segment is None else faces_of(clip, UNTRACKED)
-        self.skin = np.unique(clip.mesh.faces[~untracked])
-        self._near = cKDTree(clip.mesh.vertices[self.skin])
+    camera_from_head: np.ndarray
+    matched: int = 0
+    match_px: float = 0.0
 
-    def under(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of points [N, 3] those above or below the skin: index [n], normal there [n, 3], height above it [n] mm."""
-        along = self.normals[self.skin[self._near.query(points)[1]]]
-        face, bary, distance = self.scene.intersect(points + REACH_MM * along, -along)
-        normal = np.zeros_like(points)
-        normal[face >= 0] = interpolate(self.normals, self.mesh.faces, face[face >= 0], bary[face >= 0])
-        index = np.nonzero((face >= 0) & (distance < 2.0 * REACH_MM) & ((normal * along).sum(1) > 0.5))[0]
-        return index, normalised(normal[index]), distance[index] - REACH_MM
 
-    def lay_on(self, clip) -> Similarity:
-        """What takes the head space of another clip of this head to the one of this mesh."""
-        vertices = clip.mesh.vertices[self.skin], self.mesh.vertices[self.skin]
-        found = Similarity(*similarity_from_points(*vertices))
-        points = clip.tracks[0][np.isfinite(clip.tracks[1])]
-        for _ in range(ITERATIONS):
-            placed = found.apply(points)
-            step = self._step(placed)
-            found = step.after(found)
-            if np.abs(step.apply(placed) - placed).max() < SETTLED_MM:
-                break
-        return found
-
-    def _step(self, points: np.ndarray) -> Similarity:
-        """One Gauss-Newton step of points [N, 3] towards the surface, robust (Cauchy)."""
-        index, normal, height = self.under(points)
-        points = points[index]
-        centre = points.mean(0)
-        arm = points - centre
-        rows = np.concatenate([np.cross(arm, normal), normal, (arm * normal).sum(1, keepdims=True)], axis=1)
-        weight = 1.0 / (1.0 + np.square(height / (3.0 * np.median(np.abs(height)) + 1e-3)))
-        solved = np.linalg.lstsq(rows * np.sqrt(weight)[:, None], -height * np.sqrt(weight), rcond=None)[0]
-        turn, grow = rotation_from_vector(solved[:3]), float(np.exp(solved[6]))
-        return Similarity(grow, turn, centre + solved[3:6] - grow * turn @ centre)
+def place(main, clip, matches: Matches) -> Placed:
+    """The poses of a clip on the main clip's mesh; matches: from the main one's to its own."""
+    if len(matches) < LEAST_MATCHES:
+        raise InputError("the clips do not show the same skin", where=clip.frames.source_name,
+                         got=f"{len(matches)} texels alike", expected=f"{LEAST_MATCHES} or more",
+                         mend="film one face, the same in all clips and sharp, or solve each clip by itself")
+    chosen, poses = matches.thinned(MATCHES), clip.camera_from_head
+    pixels = project(chosen.second, poses, clip.intrinsics)[0]
+    towards = normalised(camera_centres(poses)[:, None] - chosen.second)
+    pixels[(towards * chosen.normals).sum(-1) < FACING] = np.nan
+    start = Similarity(*similarity_from_points(chosen.second, chosen.first)).pose(poses)
+    tracks = Tracks.of_equal_noise(pixels, NOISE_PX)
+    found, _ = resect(tracks, start, chosen.first, clip.intrinsics, loss_scale=2.0, iterations=20)
+    away = np.linalg.norm(project(chosen.first, found, clip.intrinsics)[0] - pixels, axis=-1)
+    return Placed(found, len(matches), float(np.nanmedian(away)))
