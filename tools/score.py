@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,8 +62,17 @@ def load_result(folder: Path, intrinsics: np.ndarray) -> Result:
     return Result(folder, read_obj(folder / "mesh.obj"), textures, poses, arrays.get("intrinsics", intrinsics))
 
 
-def score(subject: Path, export: Path, frame_count: int = 12, seed: int = 0) -> dict:
-    """All measures as nested dictionaries of floats. InputError when truth or result is missing or damaged."""
+def score(
+    subject: Path,
+    export: Path,
+    frame_count: int = 12,
+    seed: int = 0,
+    prepare: Callable[[score_align.Similarity], None] = lambda truth_from_result: None,
+) -> dict:
+    """All measures as nested dictionaries of floats. InputError when truth or result is missing or damaged.
+
+    prepare(truth_from_result) may add pictures to the result before they are looked for.
+    """
     subject, export = Path(subject), Path(export)
     if not (subject / "gt").is_dir():
         raise InputError("no ground truth", where=str(subject), expected="a gt/ folder", mend="see tools/synthesize.py")
@@ -75,6 +85,7 @@ def score(subject: Path, export: Path, frame_count: int = 12, seed: int = 0) -> 
     found_poses = np.stack([result.poses[i] for i in common])
     rng = np.random.default_rng(seed)
     alignment, scores = score_geometry(subject, result.mesh, true_poses, found_poses, rng)
+    prepare(alignment)
     aligned = np.stack([alignment.pose(pose) for pose in found_poses])
     scores["pose"] = score_measures.pose_errors(true_poses, aligned)
     scores["pose_own_alignment"] = score_measures.pose_errors_own_alignment(true_poses, found_poses)

@@ -10,24 +10,42 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from shared.io.arrays import load_arrays, read_json
-from shared.io.images import read_exr, write_exr
+from shared.io.arrays import load_arrays
+from shared.io.images import read_exr, read_png, write_exr
 from shared.io.meshes import write_obj
 from shared.solve.capture import Sizes
 from shared.solve.views import Camera, HeadViews
 from tools.bench_relight import result_poses
 from tools.relight_inputs import Asset, open_asset
-from tools.score import camera_intrinsics, score, score_geometry
+from tools.score import camera_intrinsics, score
+from tools.score_align import Similarity
 
-SIZES = Sizes(directions=768, nodes=500)
-SCORED_FRAMES, RENDERED_FRAMES = 12, 4
+SIZES = Sizes(directions=512, nodes=400)
+SCORED_FRAMES, RENDERED_FRAMES = 12, 3
+RELIT_VIEW = "front"
+REACH_PX = 6
+"""How far beside the face skin vertices are shaded as well."""
 CODE = ("tools/tradeoff_scores.py", "tools/score.py", "tools/score_align.py", "tools/score_measures.py",
         "tools/score_buffers.py")  # fmt: skip
 """What the numbers depend on beside the result."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture to make: its file below the result, camera, light [H, 2 H, 3], what moves against it, and where the
+    truth has face skin [h, w]."""
+
+    file: str
+    camera: Camera
+    light: np.ndarray
+    moves: str
+    skin: np.ndarray
 
 
 def scores_of(subject: Path, result: Path) -> dict[str, float]:
@@ -38,42 +56,60 @@ def scores_of(subject: Path, result: Path) -> dict[str, float]:
         write_obj(export / "mesh.obj", asset.mesh)
         for name in ("maps", "poses.npz", "envmap.exr"):
             os.symlink((result / name).resolve(), export / name)
-        render_pictures(subject, asset, export)
-        return flat(score(subject, export, SCORED_FRAMES))
+
+        def make_pictures(alignment: Similarity) -> None:
+            render_shots(asset, [*clip_shots(subject, asset), *relit_shots(subject, alignment)], export)
+
+        return flat(score(subject, export, SCORED_FRAMES, prepare=make_pictures))
 
 
-def render_pictures(subject: Path, asset: Asset, export: Path) -> None:
-    """renders/NNNN.exr of some frames that hold truth, relit/NAME.exr of all of relight/, through the true lens."""
-    capture, truth = read_json(subject / "capture.json"), load_arrays(subject / "gt" / "poses.npz")
-    size = capture["width"], capture["height"]
+def clip_shots(subject: Path, asset: Asset) -> list[Shot]:
+    """Some of the frames that hold truth, through the result's lens, under its light."""
     place = {int(frame): k for k, frame in enumerate(asset.frame_index)}
-    known = [int(frame) for frame in truth["gt_frames"] if int(frame) in place]
-    frames = [known[k] for k in np.unique(np.linspace(0, len(known) - 1, RENDERED_FRAMES).astype(int))]
-    clip = [Camera(asset.poses[place[frame]], asset.intrinsics, size) for frame in frames]
-    relit = _relit_cameras(subject, asset, truth["camera_from_head"], size)
-    views = HeadViews(asset.mesh, asset.maps, SIZES, [*clip, *relit.values()])
-    for folder in ("renders", "relit"):
-        (export / folder).mkdir()
-    for frame, picture in zip(frames, views.render(asset.envmap, clip, asset.moves, fade=False), strict=True):
-        write_exr(export / "renders" / f"{frame:04d}.exr", picture, colour_space="lin_rec709_scene")
+    known = [int(frame) for frame in load_arrays(subject / "gt" / "poses.npz")["gt_frames"] if int(frame) in place]
+    chosen = np.unique(np.linspace(0, len(known) - 1, RENDERED_FRAMES).astype(int))
+    shots = []
+    for frame in (known[k] for k in chosen):
+        skin = read_png(subject / "gt" / "frames" / f"{frame:04d}_mask.png") > 127
+        camera = Camera(asset.poses[place[frame]], asset.intrinsics, skin.shape[::-1])
+        shots.append(Shot(f"renders/{frame:04d}.exr", camera, asset.envmap, asset.moves, skin))
+    return shots
+
+
+def relit_shots(subject: Path, alignment: Similarity) -> list[Shot]:
+    """The front view of relight/ under each of its lights, in the result's head space."""
+    shots = []
     for path in sorted((subject / "relight").glob("*_envmap.exr")):
-        light = path.name.removesuffix("_envmap.exr")
-        pictures = views.render(read_exr(path).astype(np.float64), list(relit.values()), "head", fade=False)
-        for name, picture in zip(relit, pictures, strict=True):
-            write_exr(export / "relit" / f"{light}_{name}.exr", picture, colour_space="lin_rec709_scene")
+        name = f"{path.name.removesuffix('_envmap.exr')}_{RELIT_VIEW}"
+        pose = load_arrays(subject / "relight" / "poses.npz")[RELIT_VIEW]
+        skin = read_png(subject / "relight" / f"{name}_mask.png") > 127
+        camera = Camera(result_poses(pose[None], alignment)[0], camera_intrinsics(subject), skin.shape[::-1])
+        shots.append(Shot(f"relit/{name}.exr", camera, read_exr(path).astype(np.float64), "head", skin))
+    return shots
 
 
-def _relit_cameras(subject: Path, asset: Asset, poses: np.ndarray, size: tuple[int, int]) -> dict[str, Camera]:
-    """{view: camera} of the pictures in relight/, in the result's head space."""
-    if not (subject / "relight" / "poses.npz").is_file():
-        return {}
-    true_poses = poses[asset.frame_index]
-    alignment, _ = score_geometry(subject, asset.mesh, true_poses, asset.poses, np.random.default_rng(0))
-    views = load_arrays(subject / "relight" / "poses.npz")
-    found = result_poses(np.stack(list(views.values())), alignment)
-    return {
-        name: Camera(pose, camera_intrinsics(subject), size) for name, pose in zip(views, found, strict=True)
-    }
+def render_shots(asset: Asset, shots: list[Shot], export: Path) -> None:
+    """Writes the pictures; only what shows in face skin is shaded with care."""
+    near = [_projects_into(asset.mesh.vertices, shot) for shot in shots]
+    views = HeadViews(asset.mesh, asset.maps, SIZES, [shot.camera for shot in shots], only=np.any(near, axis=0))
+    for shot in shots:
+        picture = views.render(shot.light, [shot.camera], shot.moves, fade=False)[0]
+        path = export / shot.file
+        path.parent.mkdir(exist_ok=True)
+        write_exr(path, picture.astype(np.float32), colour_space="lin_rec709_scene")
+
+
+def _projects_into(points: np.ndarray, shot: Shot) -> np.ndarray:
+    """[N] whether points [N, 3] land in the skin of a shot or within REACH_PX of it."""
+    reach = np.ones((2 * REACH_PX + 1,) * 2, np.uint8)
+    skin = cv2.dilate(shot.skin.astype(np.uint8), reach) > 0
+    pose = shot.camera.camera_from_head
+    seen = (points @ pose[:3, :3].T + pose[:3, 3]) @ shot.camera.intrinsics.T
+    column, row = np.floor(seen[:, :2] / seen[:, 2:]).astype(int).T
+    inside = (column >= 0) & (column < skin.shape[1]) & (row >= 0) & (row < skin.shape[0])
+    found = np.zeros(len(points), bool)
+    found[inside] = skin[row[inside], column[inside]]
+    return found
 
 
 def flat(scores: Mapping, prefix: str = "") -> dict[str, float]:

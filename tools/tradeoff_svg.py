@@ -35,10 +35,10 @@ class Scale:
         return self._start + share * (self._end - self._start)
 
 
-def log_ticks(low: float, high: float) -> list[float]:
-    """1, 2 and 5 times the powers of ten between low and high."""
+def log_ticks(low: float, high: float, steps: Sequence[float] = (1, 2, 5)) -> list[float]:
+    """The steps times the powers of ten between low and high."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    return [m * 10.0**p for p in powers for m in (1, 2, 5) if low <= m * 10.0**p <= high]
+    return [m * 10.0**p for p in powers for m in steps if low <= m * 10.0**p <= high]
 
 
 def tradeoff_svg(points: Sequence[Mapping], measure: str, title: str, groups: Mapping[str, str] = GROUPS) -> str:
@@ -54,7 +54,8 @@ def tradeoff_svg(points: Sequence[Mapping], measure: str, title: str, groups: Ma
     down = Scale(*y_span, HEIGHT - BOTTOM, TOP, logarithmic=spread)
     places = {point["name"]: (across(point["seconds"]), down(point["scores"][measure])) for point in points}
     front = pareto_front(points, measure)
-    parts = _ticks(across, down, log_ticks(*x_span), log_ticks(*y_span) if spread else nice_ticks(*y_span))
+    y_ticks = log_ticks(*y_span, (1, 1.5, 2, 3, 5, 7)) if spread else nice_ticks(*y_span)
+    parts = _ticks(across, down, log_ticks(*x_span), y_ticks)
     parts += _titles(title)
     parts.append(_front([places[name] for name in front]))
     parts += [_point(point, places[point["name"]], across) for point in points]

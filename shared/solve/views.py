@@ -96,8 +96,9 @@ class HeadViews:
     """Pictures of one solved head.
 
     maps: diffuse_albedo [S, S, 3], specular_intensity [S, S], roughness [S, S]. cameras: all that will look at it, so
-    that only what they can see is traced; none: everything. progress(items, label) wraps the trace. light_resolution:
-    edge of the cubemap that lights are seen through; deep: see VertexShading; over 1 where cavities are exact.
+    that only what they can see is traced; none: everything; only [V]: vertices that matter, all by default.
+    progress(items, label) wraps the trace. light_resolution: edge of the cubemap that lights are seen through; deep:
+    see VertexShading; over 1 where cavities are exact.
     """
 
     def __init__(
@@ -109,6 +110,7 @@ class HeadViews:
         progress: Callable | None = None,
         light_resolution: int = LIGHT_RESOLUTION,
         deep: float = DEEP,
+        only: np.ndarray | None = None,
     ):
         self.light_resolution, self.deep = light_resolution, deep
         self.viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
@@ -116,7 +118,7 @@ class HeadViews:
         self.scenery = set_scenery(self.viewer, sizes or Sizes())
         poses = [camera.camera_from_head for camera in cameras]
         seen = face_front(self.viewer, np.stack(poses), -0.1) if poses else np.ones(len(mesh.vertices), bool)
-        self.index = np.nonzero(seen)[0]
+        self.index = np.nonzero(seen if only is None else seen & only)[0]
         self.points = mesh_points(mesh, self.index)
         wrap = progress or (lambda items, label: items)
         self.transfer: Transfer = self.scenery.trace(self.points, lambda items: wrap(items, "visibility"))
