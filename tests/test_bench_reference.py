@@ -28,6 +28,7 @@ def test_the_chart_says_how_much_sooner(tmp_path, capsys):
     capsys.readouterr()
     chart(log, tmp_path / "accuracy.svg")
     assert "published: best 2.000 after 400 s" in (said := capsys.readouterr().out) and said.strip().endswith("50 x")
+    assert "3.000 in the first half of 400 s, 2.000 in all" in said
     picture = (tmp_path / "accuracy.svg").read_text()
     assert picture.count('class="curve"') == 2 and "published" in picture and "matte" not in picture
 

@@ -1,8 +1,10 @@
 """The chart of speed against accuracy: its cases, its measuring, its table, its pictures."""
 
 import csv
+import shutil
 import sys
 
+import numpy as np
 import pytest
 from browser import Browser, chromium
 from toy_runs import TOY, make_subject
@@ -11,13 +13,15 @@ from shared.contract.confine import trust
 from shared.contract.pipeline import load_pipeline
 from shared.contract.subject import load_subject
 from shared.errors import InputError
-from shared.io.arrays import read_json
+from shared.io.arrays import load_arrays, read_json, save_arrays, write_json
 from tools import tradeoff_runs
+from tools.goldens import TINY_SUBJECT
+from tools.score import camera_intrinsics, score
 from tools.tradeoff_cases import ABLATIONS, GROUPS, PEER, PRESET, QUICK, ChartCase, all_cases, chosen_cases
 from tools.tradeoff_page import tradeoff_page
 from tools.tradeoff_rows import Rows, csv_row, higher_is_better, pareto_front, row_costs, summarise
 from tools.tradeoff_runs import Cost, Runs, Solved, fingerprints, measured
-from tools.tradeoff_scores import flat
+from tools.tradeoff_scores import flat, scores_of
 from tools.tradeoff_svg import Scale, log_ticks, tradeoff_svg
 
 ERROR, LIKENESS = "albedo.aligned.delta_e2000_median", "albedo.aligned.psnr_linear"
@@ -213,3 +217,30 @@ def test_the_page_answers(tmp_path):
         page.click("#groups input")
         assert page.evaluate("document.querySelectorAll('#chart circle').length") == len(POINTS) - 3
         assert page.problems == [] and page.requests == [path.resolve().as_uri()]
+
+
+# ---------------------------------------------------------------- the scores
+def test_the_truth_scores_as_the_truth(tmp_path):
+    """The tiny subject's own mesh (of the skin alone), maps, poses and light: off by what its files round."""
+    truth, names = TINY_SUBJECT / "gt", {"albedo": "diffuse_albedo", "specular": "specular_intensity"}
+    (tmp_path / "maps").mkdir()
+    for name in ("albedo", "specular", "roughness"):
+        shutil.copyfile(truth / f"{name}.exr", tmp_path / "maps" / f"{names.get(name, name)}.exr")
+    for name in ("mesh.obj", "envmap.exr"):
+        shutil.copyfile(truth / name, tmp_path / name)
+    poses = load_arrays(truth / "poses.npz")["camera_from_head"]
+    lens = {"frame_index": np.arange(len(poses)), "intrinsics": camera_intrinsics(TINY_SUBJECT)}
+    save_arrays(tmp_path / "poses.npz", camera_from_head=poses, **lens)
+    write_json(tmp_path / "solve.json", {"model": {"moves": "head"}})
+    scores = scores_of(TINY_SUBJECT, tmp_path)
+    assert scores[ERROR] < 0.8 and scores["pose.rotation_deg.mean"] < 0.02 and scores["geometry_mm.median"] < 0.5
+    assert scores["envmap.lobe25_correlation"] > 0.999 and scores["rerender.psnr"] > 10.0
+
+
+def test_a_solved_stage_is_scored_with_pictures(tiny_run):
+    """Straight from inverse_render's folder: the maps of the export, and re-renders that look like the clip."""
+    scores = scores_of(TINY_SUBJECT, tiny_run / "work" / "inverse_render")
+    exported = flat(score(TINY_SUBJECT, tiny_run / "export"))
+    assert scores[ERROR] == pytest.approx(exported[ERROR], abs=0.02)
+    assert scores["geometry_mm.median"] == exported["geometry_mm.median"]
+    assert scores["rerender.psnr"] == pytest.approx(exported["rerender.psnr"], abs=0.5)
