@@ -1,23 +1,21 @@
-"""The next item while this one is worked on: reading and decoding leave the interpreter lock alone."""
+"""The next item while this one is worked on: decoding and compiled loops leave the interpreter lock alone."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-Item, Result = TypeVar("Item"), TypeVar("Result")
+Item = TypeVar("Item")
+_END = object()
 
 
-def read_ahead(load: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """load(item) for the items in order, each begun on a second thread while the caller is busy with the one before;
-    one waits at most. What load raises, the caller gets at that item's turn."""
+def read_ahead(source: Iterable[Item]) -> Iterator[Item]:
+    """The items of source in order, each made on a second thread while the caller is busy with the one before; one
+    waits at most. What source raises, the caller gets in its turn."""
+    items = iter(source)
     with ThreadPoolExecutor(max_workers=1) as reader:
-        waiting = None
-        for item in items:
-            begun = reader.submit(load, item)
-            if waiting is not None:
-                yield waiting.result()
-            waiting = begun
-        if waiting is not None:
-            yield waiting.result()
+        waiting = reader.submit(next, items, _END)
+        while (item := waiting.result()) is not _END:
+            waiting = reader.submit(next, items, _END)
+            yield item

@@ -173,8 +173,10 @@ def _stand_ins(vertices: np.ndarray, index: np.ndarray, blocked: np.ndarray, dee
     trusted = np.nonzero(blocked < deep)[0]
     if len(trusted) == 0:
         trusted = np.arange(len(index))
-    result = trusted[cKDTree(vertices[index[trusted]]).query(vertices)[1]]
+    result = np.full(len(vertices), -1)
     result[index[trusted]] = trusted
+    others = np.nonzero(result < 0)[0]
+    result[others] = trusted[cKDTree(vertices[index[trusted]]).query(vertices[others])[1]]
     return result
 
 

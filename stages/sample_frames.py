@@ -117,19 +117,23 @@ def write_frames(reader, selection, networks, chart, job: Job) -> tuple[list[dic
     from shared.contact_sheet import ContactSheet
     from shared.crop_pixels import area_average, clipped_share, display_codes, frame_mask, is_grey
     from shared.io.images import write_png
+    from shared.read_ahead import read_ahead
 
     for folder in ("frames", "masks"):
         (job.out / folder).mkdir(parents=True, exist_ok=True)
     crop, transfer, count = selection.crop, job.subject.transfer, len(selection.frame_index)
     sheet, records, clipped, grey = ContactSheet(count), [], [], []
     chart.expect(count)
-    frames = reader.frames(selection.frame_index)
-    for i, frame in enumerate(job.progress(frames, "cropping", total=count)):
+
+    def cut_out(frame):
         whole = frame.codes()
-        chart.look(i, frame.index, whole)
         part = whole[crop.y0:crop.y0 + crop.height, crop.x0:crop.x0 + crop.width]
         codes = area_average(part, crop.size, transfer)
-        rgb = display_codes(codes, transfer)
+        return frame, whole, codes, display_codes(codes, transfer)
+
+    frames = read_ahead(map(cut_out, reader.frames(selection.frame_index)))
+    for i, (frame, whole, codes, rgb) in enumerate(job.progress(frames, "cropping", total=count)):
+        chart.look(i, frame.index, whole)
         points = (selection.landmarks[i][:, :2] - (crop.x0, crop.y0)) * crop.scale
         mask = frame_mask(rgb, networks.person_mask(rgb), points)
         records.append(frame_record(frame.index, frame.time_s, points, selection.sharpness[i]))
@@ -168,6 +172,7 @@ def check(job: Job) -> None:
     from shared.framing import Crop
     from shared.io.arrays import read_json
     from shared.io.frames import FrameSet
+    from shared.read_ahead import read_ahead
 
     frames, crop = FrameSet.open(job.out), Crop(**read_json(job.out / "frames.json")["crop"])
     source_width, source_height = frames.source_size
@@ -180,13 +185,13 @@ def check(job: Job) -> None:
     require(bool(np.all(np.diff(frames.time_s) > 0)), "times do not rise")
     corner = frames.intrinsics @ np.linalg.inv(frames.intrinsics_source) @ (crop.x0, crop.y0, 1.0)
     require(np.allclose(corner, (0, 0, 1), atol=1e-6), "the crop's intrinsics do not belong to the crop")
-    for i in range(frames.count):
-        check_frame(frames, i)
+    pictures = read_ahead((frames.read_codes(i), frames.read_mask(i)) for i in range(frames.count))
+    for i, (codes, mask) in enumerate(pictures):
+        check_frame(frames, i, codes, mask)
 
 
-def check_frame(frames, i: int) -> None:
+def check_frame(frames, i: int, codes: np.ndarray, mask: np.ndarray) -> None:
     """Sizes, mask values, and a face that is not of one colour."""
-    codes, mask = frames.read_codes(i), frames.read_mask(i)
     size = frames.size[::-1]
     require(codes.shape == (*size, 3) and mask.shape == size, f"{frames.files[i]}: wrong size")
     require(set(np.unique(mask).tolist()) <= {0, 128, FACE}, f"{frames.mask_files[i]}: values besides 0, 128, 255")

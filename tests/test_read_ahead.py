@@ -17,24 +17,24 @@ def test_results_come_in_order_and_loading_runs_ahead():
         return 10 * item
 
     found = []
-    for result in read_ahead(load, range(4)):
+    for result in read_ahead(map(load, range(4))):
         if not found:
             assert second.wait(timeout=20.0)  # the second is loaded while the first is held
         found.append(result)
     assert found == [0, 10, 20, 30] and begun == [0, 1, 2, 3]
-    assert list(read_ahead(load, [])) == []
+    assert list(read_ahead([])) == []
 
 
 def test_at_most_one_waits():
     begun = []
-    results = read_ahead(lambda item: begun.append(item) or item, iter(range(100)))
+    results = read_ahead(begun.append(item) or item for item in range(100))
     next(results)
     results.close()
     assert len(begun) <= 3
 
 
 def test_a_fault_is_raised_at_its_turn():
-    results = read_ahead(lambda item: 1 / item, [2, 0, 4])
+    results = read_ahead(1 / item for item in (2, 0, 4))
     assert next(results) == 0.5
     with pytest.raises(ZeroDivisionError):
         next(results)

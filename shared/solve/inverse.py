@@ -194,7 +194,7 @@ def _solve_light(
     capture = build_capture(
         viewer,
         scenery,
-        read_ahead(inputs.picture, progress(chosen, "gathering samples")),
+        read_ahead(map(inputs.picture, progress(chosen, "gathering samples"))),
         inputs.camera_from_head[chosen],
         lens_of_frames(inputs.intrinsics, chosen),
         settings.appearance.light_moves(inputs.moves),

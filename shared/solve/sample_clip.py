@@ -13,9 +13,10 @@ from shared.errors import InputError
 from shared.frame_quality import spread_evenly
 from shared.framing import Crop, choose_crop, face_height, skull_box
 from shared.io.image_sequence import ImageSequenceReader
-from shared.io.source import VideoInfo
+from shared.io.source import SourceFrame, VideoInfo
 from shared.io.video import VideoReader
 from shared.landmarks import FaceNetworks
+from shared.read_ahead import read_ahead
 
 CANDIDATES_PER_FRAME = 4
 ANALYSIS_SIZE_PX = 1280
@@ -54,9 +55,13 @@ def survey_clip(reader: VideoReader | ImageSequenceReader, networks: FaceNetwork
     stride = max(1, count // (CANDIDATES_PER_FRAME * frame_count))
     size = analysis_size(reader.info)
     survey = ClipSurvey(networks, mask_every=max(1, count // stride // MASKS_IN_SURVEY))
-    for frame in progress(reader.frames(), "looking for faces", total=count):
+
+    def look(frame: SourceFrame) -> tuple[SourceFrame, np.ndarray | None]:
+        unseen = frame.fault or frame.index % stride
+        return frame, None if unseen else display_codes(frame.codes(size), transfer)
+
+    for frame, rgb in progress(read_ahead(map(look, reader.frames())), "looking for faces", total=count):
         if frame.index % stride == 0:
-            rgb = None if frame.fault else display_codes(frame.codes(size), transfer)
             survey.add(frame.index, frame.time_s, rgb, frame.fault)
     return survey
 

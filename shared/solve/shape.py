@@ -149,7 +149,7 @@ class ShapeSolver:
         """Samples, shading and equations of the traced vertices; None where hardly any is seen."""
         clip, settings, index = self.clip, self.settings, traced.index
         viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
-        pictures = read_ahead(clip.picture, self.progress(range(len(clip.camera_from_head)), "shape, sampling"))
+        pictures = read_ahead(map(clip.picture, self.progress(range(len(clip.camera_from_head)), "shape, sampling")))
         blur = BLUR_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
         samples = gather_surface(viewer, index, pictures, clip.camera_from_head, clip.intrinsics, blur)
         points = mesh_points(mesh, index)

@@ -97,7 +97,7 @@ class TexturePass:
 
     def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> Evidence:
         parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]
-        ahead = read_ahead(self.frame, self.progress(frames, label))
+        ahead = read_ahead(map(self.frame, self.progress(frames, label)))
         for f, (samples, irradiance, reflection) in zip(frames, ahead, strict=True):
             if material is None:
                 robust = (samples.limits == 0).astype(np.float32)
@@ -164,7 +164,7 @@ class TexturePass:
         """Root mean square residual of each candidate on the held-out frames (linear, censored, trust-weighted)."""
         squared, total = np.zeros(len(candidates)), 0.0
         frames = self.progress(np.nonzero(~self.clip.fitted)[0], "texture, held-out frames")
-        for samples, irradiance, reflection in read_ahead(self.frame, frames):
+        for samples, irradiance, reflection in read_ahead(map(self.frame, frames)):
             total += 3.0 * float(samples.weight.sum())
             for k, material in enumerate(candidates):
                 error = _model(material, samples, irradiance, reflection) - samples.colours
