@@ -222,7 +222,7 @@ def write_lights(job: Job, writer, envmap, clips: list) -> None:
 def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     """The content of run.json: what each stage was told, what it took, what it found."""
     from shared.mesh_checks import mesh_warnings
-    from shared.report.gather import own_record, stage_record, warnings_of
+    from shared.report.gather import ladder_record, own_record, stage_record, warnings_of
 
     records, warnings = {}, []
     for name in job.input_names:
@@ -235,8 +235,10 @@ def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
         own["warnings"].append(text)
         warnings.append((STAGE.name, text))
     records[STAGE.name] = own
-    kept = ("model", "ladder", "residuals", "albedo_scale", "held_out_frames", "clips")
+    kept = ("model", "residuals", "albedo_scale", "held_out_frames", "clips")
     chosen = {key: solve[key] for key in kept if key in solve}
+    if ladder := ladder_record(job.input("inverse_render"), solve):
+        chosen["ladder"] = ladder
     return {
         "subject": job.subject.name,
         "stages": records,

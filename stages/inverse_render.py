@@ -7,9 +7,10 @@ Method   In head space a surface point's view of the sphere never changes, so vi
          and reused by all frames. Light by Gauss-Newton with the albedo eliminated, specular intensity in closed form,
          roughness by line search, stopping on held-out frames. Under that light the mesh is refined from parallax and
          shading by Gauss-Newton, coarse to fine, the light solved anew, and the refined mesh kept if held-out frames
-         fit better. Then albedo and specular intensity per texel in closed form, streaming over the frames. The solver
-         starts from a uniform light and the priors: of one clip it needs no start from init_albedo, which is an input
-         for comparison only.
+         fit better. Or (model=auto) the model is chosen first, on few points and frames: shared/solve/ladder.py. Then
+         albedo and specular intensity per texel in closed form, streaming over the frames. The solver starts from a
+         uniform light and the priors: of one clip it needs no start from init_albedo, which is an input for comparison
+         only.
          Or (solver=reference) as published: shared/solve/reference.py.
          Several clips of one head under different lights are solved as one (shared/solve/joint_clips.py): one mesh and
          one set of maps, a light and poses of each. What lies at the top is the first clip's then, and clips/ holds
@@ -22,9 +23,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from shared.contract import Job, Output, Parameter, Stage, main
-from shared.errors import LimnError
+from shared.errors import InputError, LimnError
 
 SOLVERS = ("transfer", "reference")
+MODELS = ("full", "auto")
+LADDER_SECONDS = "ladder_seconds.json"
 LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 STAGE = Stage(
@@ -47,6 +50,8 @@ STAGE = Stage(
         Output("clips/*/renders/*.exr", "re-renders of another clip", space="crop", colour_space="lin_rec709_scene",
                optional=True),
         Output("solve.json", "model, residuals, steps, scale of the albedo, held-out frames, warnings"),
+        Output(LADDER_SECONDS, "what each rung of solve.json's ladder took (model=auto)", unit="s",
+               volatile=True, optional=True),
     ),
     parameters=(
         Parameter("map_size", int, 1024, "Edge of the maps; a power of two.", "texels",
@@ -54,6 +59,10 @@ STAGE = Stage(
         Parameter("light_resolution", int, 16, "Edge of the light's cubemap faces.", "texels", choices=(4, 8, 16, 32)),
         Parameter("light_model", str, "cubemap", "What is unknown of the light: every texel of a cubemap, spherical "
                   "harmonics of its logarithm, one sun and a sky, or a lamp at the camera.", choices=LIGHT_MODELS),
+        Parameter("model", str, "full", "Solve the full model that the other parameters describe, or climb towards it "
+                  "only as far as held-out frames fit better for it.", choices=MODELS),
+        Parameter("forced", str, "", "Parts of the model that model=auto leaves as the other parameters say, separated "
+                  "by commas: visibility, specular, light, geometry."),
         Parameter("points", int, 4000, "Surface points that the light is solved from.", "", 200, 40000),
         Parameter("directions", int, 768, "Directions over the sphere.", "", 128, 8192),
         Parameter("bounce_nodes", int, 1000, "Surface nodes that exchange bounced light.", "", 50, 6000),
@@ -130,6 +139,9 @@ def read_settings(job: Job, checkpoint=None):
     from shared.solve.shape import ShapeSettings
 
     params = job.params
+    if params.model == "auto" and params.solver == "reference":
+        raise InputError("model=auto belongs to solver=transfer", where="--set inverse_render.model",
+                         mend="leave out one of the two; the reference solver takes visibility and specular as given")
     appearance = Settings(
         light_model=params.light_model,
         resolutions=tuple(n for n in (8, 16, 32) if n <= params.light_resolution) or (params.light_resolution,),
@@ -161,14 +173,25 @@ def read_settings(job: Job, checkpoint=None):
         shape=shape if params.shape else None,
         fit_frames=params.fit_frames,
         reference=read_reference(job, checkpoint) if params.solver == "reference" else None,
+        ladder=read_forced(params.forced) if params.model == "auto" else None,
     )
+
+
+def read_forced(text: str) -> frozenset[str]:
+    """Parts of the model that are not chosen; InputError for one that there is not."""
+    from shared.contract.wording import unknown_name
+    from shared.solve.ladder import PARTS
+
+    forced = frozenset(filter(None, (name.strip() for name in text.split(","))))
+    for name in sorted(forced.difference(PARTS)):
+        raise unknown_name("part of the model", name, PARTS, "--set inverse_render.forced")
+    return forced
 
 
 def read_reference(job: Job, checkpoint):
     """The reference solver's settings; InputError where the device is absent."""
     import torch
 
-    from shared.errors import InputError
     from shared.solve.reference_settings import ReferenceSettings, Weights
     from shared.solve.reference_shade import Sampling
 
@@ -285,6 +308,8 @@ def run(job: Job) -> None:
     if job.clips:
         described = zip(job.clips, inputs.describe(), own, strict=True)
         record["clips"] = [{"name": name, **placed, **frames} for name, placed, frames in described]
+    if rungs := record.get("ladder"):
+        write_json(job.out / LADDER_SECONDS, [rung.pop("seconds") for rung in rungs])
     write_json(job.out / "solve.json", record)
 
 

@@ -104,6 +104,23 @@ def test_the_best_held_out_state_wins(solution):
     assert solution.iterations[0]["held_out"] > 2.0 * solution.held_out
 
 
+def test_errors_of_frames_are_those_of_their_samples(truth):
+    """A frame that is off by 0.1 everywhere says so; samples that count less are believed less; clipped ones stay
+    silent where the model agrees with them."""
+    capture = truth[0]
+    solver = solver_of(capture)
+    model = solver.colours.clone()
+    model[:, :, 3] += 0.1
+    seen = capture.samples.weight.sum(0) > 0
+    assert seen.all() and solver.frame_errors(model) == pytest.approx(np.where(np.arange(len(seen)) == 3, 0.1, 0.0))
+    half = np.arange(len(capture.points)) % 2 == 0
+    model = solver.colours + 0.1 * torch.from_numpy(half.astype(np.float32))[None, :, None]
+    share = capture.samples.weight[half].sum(0) / capture.samples.weight.sum(0)
+    assert solver.frame_errors(model) == pytest.approx(0.1 * share, rel=1e-4)
+    solver.limits[:] = 1
+    assert solver.frame_errors(model).max() == 0.0
+
+
 def test_the_fit_stops_where_held_out_frames_stop_improving(matte):
     """Held-out frames that show nothing but noise cannot improve: two steps after the shaping ones, then the end."""
     capture, _, _ = matte
@@ -134,13 +151,13 @@ def test_a_step_that_leads_away_is_undone_and_ends_its_resolution(truth, monkeyp
     capture, _, _ = truth
     honest, trusted = module._step, []
 
-    def spoilt(solver, settings, trusts):
+    def spoilt(solver, settings, trusts, moves):
         trusted.append(trusts)
-        record, rise = honest(solver, settings, trusts)
+        record, rise, by_frame = honest(solver, settings, trusts, moves)
         if trusts:
             solver.state.albedo = solver.state.albedo * 0.5
-            return record | {"held_out": 3.0 * record["held_out"]}, 3.0 * rise
-        return record, rise
+            return record | {"held_out": 3.0 * record["held_out"]}, 3.0 * rise, by_frame
+        return record, rise, by_frame
 
     monkeypatch.setattr(module, "_step", spoilt)
     found = fit_appearance(capture, Settings(resolutions=(4, 8), steps=5, noise=(0.003, 0.01)))

@@ -41,6 +41,17 @@ def swinging(frames=FRAMES):
     return rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors), np.tile([0, 0, 900.0], (frames, 1)))
 
 
+def even_light(directions):
+    """The same from all sides."""
+    return np.ones_like(directions)
+
+
+def hard_light(directions):
+    """A small strong lamp at the upper left in a dim room."""
+    lamp = np.exp(60.0 * (directions @ normalised(np.array([-0.6, 0.5, 0.7])) - 1.0))
+    return 0.15 + 40.0 * lamp[:, None] * np.array([1.0, 0.95, 0.9])
+
+
 def make_truth(
     specular=SPECULAR, clip_at=np.inf, roughness_at=lambda positions: ROUGHNESS, lights=(true_light,), noise=NOISE
 ):

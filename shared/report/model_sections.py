@@ -14,15 +14,28 @@ from shared.report.sections import flat, number, table
 
 def ladder_section(content: ReportContent) -> str:
     """The models that were tried, in order, each with its error on held-out frames."""
-    rungs = content.ladder or solved_rungs(content.iterations, content.residuals, content.model)
-    if not rungs:
+    parts = [climbed_table(content.ladder)] if content.ladder else []
+    rungs = solved_rungs(content.iterations, content.residuals, content.model)
+    if not rungs and not parts:
         return "<p>Nothing was recorded.</p>"
-    columns = list(dict.fromkeys(key for rung in rungs for key in rung))
-    rows = [[number(rung.get(column)) for column in columns] for rung in rungs]
-    numeric = [k for k, column in enumerate(columns)
-               if all(isinstance(rung.get(column), (int, float, type(None))) for rung in rungs)]
-    chosen = f"<h3>Chosen</h3>{table(('part', 'choice'), [(k, number(v)) for k, v in flat(content.model)])}"
-    return table([column.replace("_", " ") for column in columns], rows, numbers=numeric) + chosen
+    if rungs:
+        columns = list(dict.fromkeys(key for rung in rungs for key in rung))
+        rows = [[number(rung.get(column)) for column in columns] for rung in rungs]
+        numeric = [k for k, column in enumerate(columns)
+                   if all(isinstance(rung.get(column), (int, float, type(None))) for rung in rungs)]
+        parts.append(table([column.replace("_", " ") for column in columns], rows, numbers=numeric))
+    parts.append(f"<h3>Chosen</h3>{table(('part', 'choice'), [(k, number(v)) for k, v in flat(content.model)])}")
+    return "".join(parts)
+
+
+def climbed_table(ladder: Sequence[Mapping]) -> str:
+    """The ladder of models, rung by rung."""
+    head = ("part", "rung", "held-out error", "fell by", "standard error", "climbed", "seconds")
+    keys = ("part", "rung", "held_out", "fall", "standard_error", "climbed", "seconds")
+    rows = [[number(rung[key]).replace("_", " ") for key in keys] for rung in ladder]
+    note = ('<p class="note">The ladder, climbed on few points and frames: a rung stays where the error on frames that '
+            "were held out falls by more than its standard error. What it led to was then solved in full:</p>")
+    return table(head, rows, numbers=(2, 3, 4, 6)) + note
 
 
 def solved_rungs(

@@ -177,11 +177,14 @@ class AppearanceSolver:
 
     def set_light(self, stage: tuple[str, int]) -> None:
         """Goes on with a light of another model or resolution, as close to the present one as it can be."""
-        model, capture = make_light_model(*stage, len(self.light_frames)), self.capture
-        self.frame_light = FrameLight(
-            model.resolution, capture.directions, capture.world_from_head, capture.light_index
-        )
-        self.state.params, self.state.light_model = model.fit(self.state.light), model
+        model = make_light_model(*stage, len(self.light_frames))
+        self.take_state(replace(self.state, params=model.fit(self.state.light), light_model=model))
+
+    def take_state(self, state: State) -> None:
+        """Goes on from a state of these points as it is."""
+        self.state, capture = state, self.capture
+        resolution = state.light_model.resolution
+        self.frame_light = FrameLight(resolution, capture.directions, capture.world_from_head, capture.light_index)
 
     def subset(self, index: slice) -> AppearanceSolver:
         """A solver of some of the points that shares the rest, with a state of its own."""
@@ -352,3 +355,10 @@ class AppearanceSolver:
             weight = self.trust * chosen
             result.append(float(((weight * squared).sum() / (3.0 * weight.sum()).clamp_min(1e-9)).sqrt()))
         return result[0], result[1]
+
+    def frame_errors(self, model: torch.Tensor) -> np.ndarray:
+        """[F] mean absolute residual of each frame, weighted and censored likewise: unlike a mean square not ruled by
+        the few samples that a wrong shape or a shadow's edge spoils."""
+        error = (model - self.colours).abs() * (~self._errors(model)[1])
+        total = (3.0 * self.trust.sum((0, 1))).clamp_min(1e-9)
+        return ((self.trust * error).sum((0, 1)) / total).double().numpy()

@@ -33,7 +33,7 @@ ROUGHNESS_SEARCHES = (2, 1)
 class Solution:
     """The best State by held-out residual; iterations: one record per step; fitted and held_out: its residuals; gloss:
     where roughness varies over the skin, how, and gloss_record what the held-out frames said to that; trusted: whether
-    highlights took part to the end."""
+    highlights took part to the end; frame_errors [F]: each frame's mean absolute residual."""
 
     state: State
     iterations: tuple[dict, ...]
@@ -42,6 +42,7 @@ class Solution:
     gloss: GlossEquations | None = None
     gloss_record: dict = field(default_factory=dict)
     trusted: bool = True
+    frame_errors: np.ndarray | None = None
 
 
 def fit_appearance(
@@ -49,9 +50,11 @@ def fit_appearance(
     settings: Settings,
     report: Callable[[dict], None] = lambda record: None,
     start: Solution | None = None,
+    keep_start: bool = False,
 ) -> Solution:
     """Fits light, albedo, specular intensity and roughness; report receives each step's record. start: the solution of
-    a capture much like this one, from which only the last resolution is gone through again.
+    a capture much like this one, from which only the last resolution is gone through again; keep_start: its light as it
+    is may win, too.
 
     The first steps only give the light its shape; highlights, which then begin to say something about the scale,
     take part from the fourth, but not again after a step that had to be undone. Only states after the first steps, of
@@ -69,25 +72,26 @@ def fit_appearance(
         last, searches = np.inf, 0
         worthwhile = _WORTHWHILE if stage == len(schedule) - 1 else _WORTHWHILE_COARSE
         shaping_steps = min(SHAPING_STEPS, settings.steps - 1) if stage == 0 and start is None else 0
-        least = shaping_steps + 2 if stage == 0 else 1
+        least = (shaping_steps + 2 if stage == 0 else 1) + keep_start
         kept = None
         for number in range(settings.steps):
             shaping = number < shaping_steps
-            record, rise = _step(solver, settings, trusts and not shaping)
+            moves = number > 0 or not keep_start
+            record, rise, by_frame = _step(solver, settings, trusts and not shaping, moves)
             record |= {"light": model, "resolution": resolution, "step": number}
             if kept is not None and rise > _LARGEST_RISE:
                 solver.state, solver.lobes, trusts = kept[1], None, False
                 records.append(record | {"undone": True})
                 report(records[-1])
                 if best is None and model == settings.light_model:
-                    best = (kept[0]["held_out" if judges else "fitted"], kept[0], _copy(solver.state))
+                    best = (kept[0]["held_out" if judges else "fitted"], kept[0], _copy(solver.state), kept[2])
                 break
-            kept = record, _copy(solver.state)
+            kept = record, _copy(solver.state), by_frame
             records.append(record)
             report(record)
             judged = record["held_out" if judges else "fitted"]
             if not shaping and model == settings.light_model and (best is None or judged < best[0]):
-                best = (judged, record, _copy(solver.state))
+                best = (judged, record, _copy(solver.state), by_frame)
             settled = judged > last * (1.0 - _SETTLED)
             wanted = settings.specular and settings.search_roughness and number + 1 < settings.steps
             if wanted and settled and searches < ROUGHNESS_SEARCHES[min(stage, 1)]:
@@ -96,8 +100,9 @@ def fit_appearance(
             elif not shaping and number >= least and judged > last * (1.0 - worthwhile):
                 break
             last = judged
-    _, record, state = best
-    return Solution(state, tuple(records), record["fitted"], record["held_out"], trusted=trusts)
+    _, record, state, by_frame = best
+    errors = record["fitted"], record["held_out"]
+    return Solution(state, tuple(records), *errors, trusted=trusts, frame_errors=by_frame)
 
 
 def with_local_roughness(capture: Capture, settings: Settings, solution: Solution) -> Solution:
@@ -105,22 +110,25 @@ def with_local_roughness(capture: Capture, settings: Settings, solution: Solutio
     if not (settings.specular and settings.local_roughness):
         return solution
     solver = AppearanceSolver(capture, settings)
-    solver.state = _copy(solution.state)
-    solver.set_light((settings.light_model, solution.state.light_model.resolution))
+    solver.take_state(_copy(solution.state))
     gloss, said = local_roughness(solver)
     return replace(solution, gloss=gloss, gloss_record=said)
 
 
-def _step(solver: AppearanceSolver, settings: Settings, trusts: bool) -> tuple[dict, float]:
-    """One step of everything -> its record, and by what factor the robust loss rose; trusts: highlights say something
-    about the scale and their own strength."""
+def _step(
+    solver: AppearanceSolver, settings: Settings, trusts: bool, moves: bool = True
+) -> tuple[dict, float, np.ndarray]:
+    """One step of everything -> its record, by what factor the robust loss rose, and the error of each frame [F];
+    trusts: highlights say something about the scale and their own strength; moves: the light changes, and not only its
+    scale."""
     solver.trust_highlights = trusts
     solver.bake()
     if settings.specular and solver.lobes is None:
         solver.bake_lobes()
     step = LightStep(solver)
     before, spread = solver.loss(solver.model(step.irradiance, step.reflection))
-    step.take()
+    if moves:
+        step.take()
     step.settle()
     state = solver.state
     state.node_albedo = state.albedo[solver.node_to_point]
@@ -134,7 +142,7 @@ def _step(solver: AppearanceSolver, settings: Settings, trusts: bool) -> tuple[d
         "cost": step.before,
         "specular_intensity": state.specular,
         "roughness": state.roughness,
-    }, rise
+    }, rise, solver.frame_errors(model)
 
 
 def _copy(state: State) -> State:

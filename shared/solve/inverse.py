@@ -69,7 +69,8 @@ class InverseSettings:
     """sizes of the light's problem, its settings, frames it is solved from, edge of the maps, hold-out period.
 
     shape: how the mesh is refined, None: it stays as it is; fit_frames: how many frames to fit, chosen to cover the
-    face, 0: all but those held out; reference: solve by the published algorithm instead."""
+    face, 0: all but those held out; reference: solve by the published algorithm instead; ladder: choose the model, up
+    to what the settings say, and leave only the named parts of it as they say."""
 
     sizes: Sizes = field(default_factory=Sizes)
     appearance: Settings = field(default_factory=Settings)
@@ -79,6 +80,7 @@ class InverseSettings:
     shape: ShapeSettings | None = field(default_factory=ShapeSettings)
     fit_frames: int = 0
     reference: ReferenceSettings | None = None
+    ladder: frozenset[str] | None = None
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,23 @@ class InverseResult:
     viewer: SurfaceViewer
     fitted: np.ndarray
     record: dict
+
+
+@dataclass(frozen=True)
+class LitClip:
+    """A clip before its texture pass: the inputs with the mesh that was chosen and its viewer and scenery, settings of
+    the model that was chosen, the capture and its solution, what became of the mesh, the ladder's rungs; tracked: the
+    solution before the mesh was refined, where it was tried."""
+
+    inputs: InverseInputs
+    settings: InverseSettings
+    viewer: SurfaceViewer
+    scenery: Scenery
+    capture: Capture
+    solution: Solution
+    shape_record: dict
+    rungs: tuple[dict, ...]
+    tracked: Solution | None = None
 
 
 def solve_clip(
@@ -110,27 +129,13 @@ def solve_clip(
         from shared.solve.reference_clip import solve_by_reference
 
         return solve_by_reference(inputs, settings, settings.reference, fitted, progress, note)
-    scenery = set_scenery(viewer, settings.sizes, settings.appearance.visibility)
     moves = settings.appearance.light_moves(inputs.moves)
     light = int(inputs.light_index[sights[0].frame]) if sights else 0
     chart, warning = state_chart(sights, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves, light)
-    solution, capture = _solve_light(inputs, settings, viewer, scenery, fitted, chart, progress, note)
-    shape_record = {"refined": False}
-    if settings.shape is not None and inputs.face_segment is not None:
-        known = Reflectance.of(solution, scenery)
-        frames = frames_of(inputs, settings, settings.shape.frames, fitted)
-        reshaped = reshape(inputs, frames, known, settings.appearance, settings.sizes, settings.shape, progress, note)
-        viewer_then = SurfaceViewer(reshaped.mesh, RayScene(reshaped.mesh.vertices, reshaped.mesh.faces))
-        scenery_then = set_scenery(viewer_then, settings.sizes, settings.appearance.visibility)
-        more = viewer_then, scenery_then, fitted, chart, progress, note, solution
-        then, capture_then = _solve_light(reshaped, settings, *more)
-        shape_record = judge_shape(solution, then)
-        note(f"refined mesh: {shape_record}")
-        if shape_record["refined"]:
-            inputs, viewer, scenery = reshaped, viewer_then, scenery_then
-            solution, capture = then, capture_then
-    solution = with_local_roughness(capture, settings.appearance, solution)
-    shading = shade_vertices(inputs, settings.appearance, viewer, scenery, solution, progress)
+    lit = solve_light(inputs, settings, viewer, fitted, chart, progress, note)
+    inputs, settings, viewer = lit.inputs, lit.settings, lit.viewer
+    solution = with_local_roughness(lit.capture, settings.appearance, lit.solution)
+    shading = shade_vertices(inputs, settings.appearance, viewer, lit.scenery, solution, progress)
     surface = TexelSurface(inputs.mesh, settings.map_size)
     clip = Clip(inputs.picture, inputs.camera_from_head, inputs.intrinsics, fitted, inputs.light_index)
     typical = np.median(solution.state.albedo, axis=0)
@@ -141,9 +146,39 @@ def solve_clip(
     roughness = solution.state.roughness if gloss is None else gloss.roughness(inputs.mesh.vertices)
     maps = make_maps(surface, material, roughness)
     warnings = [*[warning] * bool(warning), *doubt_scale(chart, typical)]
-    record = {"texture": texture_record, "shape": shape_record, "warnings": warnings}
-    record |= {"albedo_scale": describe_scale(chart, typical)}
+    record = {"texture": texture_record, "shape": lit.shape_record, "warnings": warnings}
+    record |= {"albedo_scale": describe_scale(chart, typical), "rungs": lit.rungs}
     return InverseResult(solution, material, maps, shading, viewer, fitted, record)
+
+
+def solve_light(
+    inputs: InverseInputs, settings: InverseSettings, viewer: SurfaceViewer, fitted, chart, progress, note
+) -> LitClip:
+    """Light and mesh: those of the full model, or of the one that the ladder leads to."""
+    start, tracked, shape_record, rungs = None, None, {"refined": False}, ()
+    if settings.ladder is not None:
+        from shared.solve.ladder_clip import climb
+
+        climbed = climb(inputs, settings, fitted, chart, progress, note)
+        inputs, settings, start = climbed.inputs, climbed.settings, climbed.start
+        shape_record, rungs = climbed.shape_record, climbed.rungs
+        viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
+    scenery = set_scenery(viewer, settings.sizes, settings.appearance.visibility)
+    solution, capture = _fit_light(inputs, settings, viewer, scenery, fitted, chart, progress, note, start)
+    if settings.shape is not None and inputs.face_segment is not None:
+        known = Reflectance.of(solution, scenery)
+        frames = frames_of(inputs, settings, settings.shape.frames, fitted)
+        reshaped = reshape(inputs, frames, known, settings.appearance, settings.sizes, settings.shape, progress, note)
+        viewer_then = SurfaceViewer(reshaped.mesh, RayScene(reshaped.mesh.vertices, reshaped.mesh.faces))
+        scenery_then = set_scenery(viewer_then, settings.sizes, settings.appearance.visibility)
+        more = viewer_then, scenery_then, fitted, chart, progress, note, solution
+        then, capture_then = _fit_light(reshaped, settings, *more)
+        tracked, shape_record = solution, judge_shape(solution, then)
+        note(f"refined mesh: {shape_record}")
+        if shape_record["refined"]:
+            inputs, viewer, scenery = reshaped, viewer_then, scenery_then
+            solution, capture = then, capture_then
+    return LitClip(inputs, settings, viewer, scenery, capture, solution, shape_record, rungs, tracked)
 
 
 def judge_shape(before: Solution, after: Solution) -> dict:
@@ -186,27 +221,37 @@ def segment_vertices(inputs: InverseInputs, names: tuple[str, ...]) -> np.ndarra
     return found
 
 
-def _solve_light(
+def _fit_light(
     inputs, settings, viewer, scenery: Scenery, fitted, chart, progress, note, start: Solution | None = None
 ) -> tuple[Solution, Capture]:
-    chosen, kept = frames_of(inputs, settings, settings.light_frames, fitted)
+    frames = frames_of(inputs, settings, settings.light_frames, fitted)
+    moves, count = settings.appearance.light_moves(inputs.moves), settings.sizes.points
+    capture = replace(capture_skin(inputs, viewer, scenery, frames, moves, count, progress), chart=chart)
+    climbed = settings.ladder is not None and start is not None
+    step = (lambda record: note(_describe(record))), start, climbed
+    return fit_appearance(capture, settings.appearance, *step), capture
+
+
+def capture_skin(
+    inputs, viewer, scenery: Scenery, frames: tuple[np.ndarray, np.ndarray], moves: str, count: int, progress
+) -> Capture:
+    """What at most count points of the face's skin show; frames: which, and which of them are fitted."""
+    chosen, fitted = frames
     skin = segment_vertices(inputs, FACE_SKIN)
-    capture = build_capture(
+    return build_capture(
         viewer,
         scenery,
         read_ahead(map(inputs.picture, progress(chosen, "gathering samples"))),
         inputs.camera_from_head[chosen],
         lens_of_frames(inputs.intrinsics, chosen),
-        settings.appearance.light_moves(inputs.moves),
-        kept,
+        moves,
+        fitted,
         allowed=skin,
         skin=skin,
-        count=settings.sizes.points,
+        count=count,
         progress=lambda items: progress(items, "tracing visibility"),
         light_index=inputs.light_index[chosen],
     )
-    capture = replace(capture, chart=chart)
-    return fit_appearance(capture, settings.appearance, lambda record: note(_describe(record)), start), capture
 
 
 def describe_light(state) -> str:
@@ -284,6 +329,7 @@ def summarise(inputs: InverseInputs, result: InverseResult) -> dict:
             "texture_held_out": result.record["texture"]["held_out"],
         },
         **{key: result.record[key] for key in ("shape",) if key in result.record},
+        **({"ladder": [dict(rung) for rung in result.record["rungs"]]} if result.record.get("rungs") else {}),
         "iterations": list(solution.iterations),
         "albedo_scale": result.record["albedo_scale"],
         "seen_share_of_texels": round(float(seen.mean()), 4),

@@ -211,13 +211,19 @@ class ShapeSolver:
         largest = LARGEST_STEP_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
         return np.clip(offsets, -largest, largest)
 
-    def refine(self, mesh: Mesh, shaped: np.ndarray, held: np.ndarray) -> tuple[Mesh, Mesh]:
-        """The mesh subdivided as the settings say, as it was and refined. shaped, held [faces] bool."""
-        start = mesh
+    def refine(
+        self, mesh: Mesh, shaped: np.ndarray, held: np.ndarray, begun: Mesh | None = None
+    ) -> tuple[Mesh, Mesh]:
+        """The mesh subdivided as the settings say, as it was and refined. shaped, held [faces] bool; begun: the mesh,
+        or a subdivision of it, as it was refined before: goes on from the next one."""
+        start, mesh = mesh, mesh if begun is None else begun
         for level in range(self.settings.subdivisions + 1):
             if level > 0:
-                shaped, held = np.repeat(shaped, 4), np.repeat(held, 4)
-                start, mesh = subdivide(start), subdivide(mesh)
+                shaped, held, start = np.repeat(shaped, 4), np.repeat(held, 4), subdivide(start)
+            if begun is not None and len(begun.faces) >= len(start.faces):
+                continue
+            if len(mesh.faces) < len(start.faces):
+                mesh = subdivide(mesh)
             mesh = self._refine_level(mesh, start.vertices, shaped, held, level)
         return start, mesh
 

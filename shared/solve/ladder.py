@@ -1,0 +1,192 @@
+"""No more model than the scene needs: models of rising cost, climbed while held-out frames fit better for it.
+
+Each part of the model has rungs of its own, from the least to the most:
+
+    visibility  off, on, bounces
+    specular    none, one_value
+    light       harmonics_2, sun_sky, harmonics_4, cubemap_8, cubemap_16, cubemap_32
+
+The climb starts at the bottom of all and tries the next rung of one part after the other, each from the solution
+below it, until no part climbs any more. A rung is climbed if the mean absolute error on held-out frames, paired frame
+by frame, falls by more than its standard error, and by more than a step of the solver that is worth while. Rungs are
+not all nested (a sun in the sky is no special case of harmonics), so that the one beyond a rung that did not serve is
+tried, too.
+
+References: Breiman et al., Classification and regression trees, 1984, 3.4.3 (the one-standard-error rule).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from shared.solve.appearance import AppearanceSolver, Capture, Settings
+from shared.solve.fit_appearance import Solution, fit_appearance
+
+LIGHTS = {
+    "harmonics_2": ("harmonics_2", 8),
+    "sun_sky": ("sun_sky", 16),
+    "harmonics_4": ("harmonics_4", 8),
+    "cubemap_8": ("cubemap", 8),
+    "cubemap_16": ("cubemap", 16),
+    "cubemap_32": ("cubemap", 32),
+}
+"""Model and resolution of each rung of the light."""
+VISIBILITIES = ("off", "on", "bounces")
+SPECULARS = ("none", "one_value")
+WORTHWHILE = 0.005
+"""Share of the error that a rung must save besides: as much as the solver leaves when it stops."""
+PARTS = ("visibility", "specular", "light", "geometry")
+"""What can be forced."""
+FEWEST_HELD_OUT = 3
+"""Frames, below which differences between them have no standard error."""
+CLIMB_STEPS = 8
+LOOK_AHEAD = 2
+
+
+class Model(NamedTuple):
+    """A rung of each part."""
+
+    visibility: str
+    specular: str
+    light: str
+
+    def applied(self, settings: Settings) -> Settings:
+        """Settings of this model."""
+        light_model, resolution = LIGHTS.get(self.light, (self.light, settings.resolutions[-1]))
+        return replace(
+            settings,
+            light_model=light_model,
+            resolutions=(resolution,),
+            visibility=self.visibility != "off",
+            bounce=self.visibility == "bounces",
+            specular=self.specular != "none",
+        )
+
+
+def allowed_rungs(settings: Settings, forced: frozenset[str] = frozenset()) -> dict[str, tuple[str, ...]]:
+    """The rungs of each part up to what the settings say; of forced parts only that."""
+    finest = max(settings.resolutions)
+    lights = tuple(name for name, (model, resolution) in LIGHTS.items() if model != "cubemap" or resolution <= finest)
+    visibility = 1 + settings.visibility + (settings.visibility and settings.bounce)
+    rungs = {
+        "visibility": VISIBILITIES[:visibility],
+        "specular": SPECULARS[: 1 + settings.specular],
+        "light": lights if settings.light_model == "cubemap" else (settings.light_model,),
+    }
+    return {part: names[-1:] if part in forced else names for part, names in rungs.items()}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A model's solution on the small capture, its error in each held-out frame [H], and the seconds it took."""
+
+    model: Model
+    solution: Solution
+    errors: np.ndarray
+    seconds: float
+
+
+def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+    """By how much the errors [H] of the same frames fell in the mean, and the standard error of that."""
+    falls = before - after
+    return float(falls.mean()), float(falls.std(ddof=1) / np.sqrt(len(falls)))
+
+
+def serves(before: np.ndarray, after: np.ndarray) -> bool:
+    """Whether errors [H] fell by more than chance."""
+    fall, standard_error = gain(before, after)
+    return fall > max(standard_error, WORTHWHILE * float(before.mean()))
+
+
+class Ladder:
+    """Climbs the appearance's parts on small captures of a clip.
+
+    captures: with visibility (True) and without; report: receives a record of each rung that was tried.
+    """
+
+    def __init__(
+        self,
+        captures: Mapping[bool, Capture],
+        settings: Settings,
+        rungs: Mapping[str, tuple[str, ...]],
+        report: Callable[[dict], None] = lambda record: None,
+    ):
+        self.captures, self.rungs, self.report = captures, rungs, report
+        self.settings = replace(settings, steps=min(settings.steps, CLIMB_STEPS))
+        self.tried: set[Model] = set()
+        self.present: Trial | None = None
+
+    def climb(self) -> Trial:
+        """The model that no rung beyond serves better."""
+        if self.present is None:
+            self.begin(Model(**{part: names[0] for part, names in self.rungs.items()}))
+            self.report(describe("start", ", ".join(self.present.model), self.present))
+        while any([self._climb_part(part) for part in self.rungs]):
+            pass
+        return self.present
+
+    def begin(self, model: Model, start: Solution | None = None) -> None:
+        """Solves a model to climb from, from a solution or from a uniform light."""
+        self.present = self._try(model, start)
+        self.tried.add(model)
+
+    def _capture(self, model: Model) -> Capture:
+        return self.captures[model.visibility != "off"]
+
+    def _climb_part(self, part: str) -> bool:
+        """Goes up one part as far as it serves."""
+        names, climbed, missed = self.rungs[part], False, 0
+        place = names.index(getattr(self.present.model, part))
+        while missed < LOOK_AHEAD and place + 1 < len(names):
+            place += 1
+            model = self.present.model._replace(**{part: names[place]})
+            if model in self.tried:
+                missed += 1
+                continue
+            self.tried.add(model)
+            trial = self._try(model, self.present.solution)
+            if part == "visibility" and self._at_bottom():
+                # What fits without shadows can be a long way from what fits with them.
+                trial = min(trial, self._try(model, None), key=lambda trial: trial.errors.mean())
+            better = serves(self.present.errors, trial.errors)
+            self.report(describe(part, names[place], trial, self.present, better))
+            if better:
+                self.present, climbed, missed = trial, True, 0
+            else:
+                missed += 1
+        return climbed
+
+    def _at_bottom(self) -> bool:
+        """Whether nothing but the visibility has climbed."""
+        return all(getattr(self.present.model, part) == self.rungs[part][0] for part in ("specular", "light"))
+
+    def _try(self, model: Model, start: Solution | None) -> Trial:
+        begun = time.perf_counter()
+        settings, capture, keep_start = model.applied(self.settings), self._capture(model), start is not None
+        if start is None:
+            start = Solution(AppearanceSolver(capture, settings).state, (), np.inf, np.inf)
+        if settings.specular and start.state.specular == 0.0:
+            fresh = replace(start.state, specular=settings.specular_prior[0], roughness=settings.roughness)
+            start = replace(start, state=fresh)
+        solution = fit_appearance(capture, settings, start=start, keep_start=keep_start)
+        errors = solution.frame_errors[~capture.fitted]
+        return Trial(model, solution, errors, time.perf_counter() - begun)
+
+
+def describe(part: str, rung: str, trial: Trial, below: Trial | None = None, climbed: bool = True) -> dict:
+    """A rung's line of the record; the standard error is that of the fall."""
+    fall, standard_error = (None, None) if below is None else gain(below.errors, trial.errors)
+    return {
+        "part": part,
+        "rung": rung,
+        "held_out": float(trial.errors.mean()),
+        "fall": fall,
+        "standard_error": standard_error,
+        "climbed": climbed,
+        "seconds": round(trial.seconds, 3),
+    }

@@ -1,0 +1,143 @@
+"""The ladder of models: the rule by which a rung is climbed, and where it ends on captures whose truth is known."""
+
+import json
+
+import numpy as np
+import pytest
+from toy_capture import NOISE, even_light, hard_light, make_truth
+
+from shared.errors import InputError
+from shared.report.gather import ladder_record
+from shared.report.model_sections import climbed_table
+from shared.solve.appearance import Settings
+from shared.solve.ladder import LIGHTS, Ladder, Model, allowed_rungs, gain, serves
+from stages.inverse_render import STAGE, read_forced, read_settings
+
+CAREFUL = Settings(resolutions=(8, 16), noise=(0.003, 0.01))
+
+
+def climbed(capture, settings=CAREFUL, **rungs):
+    """The ladder and the record of its rungs; visibility off would need a transfer of its own."""
+    records = []
+    allowed = allowed_rungs(settings) | {"visibility": ("on", "bounces")} | rungs
+    ladder = Ladder({True: capture}, settings, allowed, records.append)
+    ladder.climb()
+    return ladder, records
+
+
+@pytest.fixture(scope="module")
+def matte(one_thread):
+    return climbed(make_truth(specular=0.0, lights=(even_light,))[0])
+
+
+@pytest.fixture(scope="module")
+def glossy(one_thread):
+    return climbed(make_truth(lights=(hard_light,))[0])
+
+
+def test_a_matte_evenly_lit_head_ends_low(matte):
+    ladder, records = matte
+    assert ladder.present.model.specular == "none"
+    assert ladder.present.model.light == "harmonics_2"
+    refused = {record["rung"] for record in records if not record["climbed"]}
+    assert {"one_value", "sun_sky", "harmonics_4"} <= refused
+    assert ladder.present.errors.mean() < 1.5 * NOISE
+
+
+def test_a_glossy_hard_lit_head_climbs(glossy):
+    ladder, records = glossy
+    assert ladder.present.model.specular == "one_value"
+    assert list(LIGHTS).index(ladder.present.model.light) > list(LIGHTS).index("harmonics_2")
+    assert ladder.present.errors.mean() < 0.5 * records[0]["held_out"]
+
+
+def test_every_rung_is_on_the_record_with_its_error_and_seconds(glossy):
+    ladder, records = glossy
+    assert records[0]["part"] == "start" and records[0]["fall"] is None
+    held_out = records[0]["held_out"]
+    for record in records[1:]:
+        assert record["fall"] == pytest.approx(held_out - record["held_out"], abs=1e-12)
+        assert record["climbed"] == (record["fall"] > max(record["standard_error"], 0.005 * held_out))
+        assert record["seconds"] > 0.0
+        held_out = record["held_out"] if record["climbed"] else held_out
+    assert held_out == pytest.approx(float(ladder.present.errors.mean()))
+    assert len(ladder.tried) == len(records)  # no model twice
+
+
+def test_a_ladder_goes_on_where_it_stands(glossy):
+    ladder, records = glossy
+    before, count = ladder.present, len(records)
+    assert ladder.climb() is before and len(records) == count
+
+
+def test_the_fall_is_paired_by_frame():
+    """Frames differ by far more than the models do: only the differences count."""
+    rng = np.random.default_rng(0)
+    frames = rng.uniform(0.01, 0.05, 12)
+    better = frames - 0.001 + 0.0004 * rng.normal(size=12)
+    fall, standard_error = gain(frames, better)
+    assert fall == pytest.approx(0.001, abs=0.0003) and standard_error < 0.0003 < frames.std()
+    assert serves(frames, better)
+    assert not serves(better, frames)
+
+
+def test_a_fall_within_its_standard_error_does_not_serve():
+    frames = np.full(9, 0.02)
+    after = frames - 0.001
+    after[0] += 0.012  # one frame loses what the others gain, and more
+    assert gain(frames, after)[0] < gain(frames, after)[1]
+    assert not serves(frames, after)
+    assert not serves(frames, frames - 0.00002)  # all frames gain, but next to nothing
+
+
+def test_settings_bound_the_ladder_and_force_its_rungs():
+    free = allowed_rungs(Settings())
+    assert free["visibility"] == ("off", "on", "bounces") and free["specular"] == ("none", "one_value")
+    assert free["light"][0] == "harmonics_2" and free["light"][-1] == "cubemap_16"
+    assert allowed_rungs(Settings(bounce=False))["visibility"] == ("off", "on")
+    assert allowed_rungs(Settings(visibility=False))["visibility"] == ("off",)
+    assert allowed_rungs(Settings(specular=False))["specular"] == ("none",)
+    assert allowed_rungs(Settings(light_model="sun_sky"))["light"] == ("sun_sky",)
+    assert allowed_rungs(Settings(), frozenset({"light", "specular"})) == free | {
+        "light": ("cubemap_16",), "specular": ("one_value",)}
+
+
+def test_a_model_becomes_the_solvers_settings():
+    settings = Model("on", "none", "harmonics_4").applied(Settings())
+    assert settings.visibility and not settings.bounce and not settings.specular
+    assert (settings.light_model, settings.resolutions) == ("harmonics_4", (8,))
+    camera = Model("bounces", "one_value", "camera").applied(Settings(light_model="camera"))
+    assert (camera.light_model, camera.resolutions) == ("camera", (16,))
+
+
+class Told:
+    """A stage's parameters with some changed."""
+
+    def __init__(self, **changes):
+        from shared.contract.job import Parameters
+
+        self.params = Parameters({**STAGE.defaults(), **STAGE.parse(changes, "test")})
+
+
+def test_the_stage_climbs_only_when_told_to():
+    assert read_settings(Told()).ladder is None
+    assert read_settings(Told(model="auto")).ladder == frozenset()
+    assert read_settings(Told(model="auto", forced="light, geometry")).ladder == {"light", "geometry"}
+
+
+def test_forcing_what_there_is_not_is_one_clear_line():
+    with pytest.raises(InputError, match="unknown part of the model 'ligth'.*did you mean light"):
+        read_forced("ligth")
+    with pytest.raises(InputError, match="model=auto belongs to solver=transfer"):
+        read_settings(Told(model="auto", solver="reference"))
+
+
+def test_the_ladder_reaches_run_json_and_the_report(glossy, tmp_path):
+    _, records = glossy
+    rungs = [dict(record) for record in records]
+    seconds = [rung.pop("seconds") for rung in rungs]
+    (tmp_path / "ladder_seconds.json").write_text(json.dumps(seconds))
+    merged = ladder_record(tmp_path, {"ladder": rungs})
+    assert merged == [dict(record) for record in records]
+    page = climbed_table(merged)
+    assert page.count("<tr>") == 1 + len(records) and "harmonics 2" in page
