@@ -167,7 +167,12 @@ def _cap(directions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return _disc(directions, 0.0, 40.0, 7) * [60.0, 58.0, 54.0]
 
 
-ENVIRONMENTS = {"room": _room, "studio": _studio, "sky": _sky, "lamp": _lamp, "cap": _cap}
+def _even(directions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Nearly the same from all sides, as between white sheets: a little brighter above than below."""
+    return _gradient(directions, floor=(0.85, 0.84, 0.83), horizon=(1.0, 1.0, 1.0), zenith=(1.1, 1.1, 1.1))
+
+
+ENVIRONMENTS = {"room": _room, "studio": _studio, "sky": _sky, "lamp": _lamp, "cap": _cap, "even": _even}
 
 
 def _gradient(directions: np.ndarray, floor: tuple, horizon: tuple, zenith: tuple) -> np.ndarray:
