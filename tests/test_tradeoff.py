@@ -29,9 +29,10 @@ CLIP = {"frames": 48, "height": 400}
 
 
 def point(name, seconds, error, group="ablation", **more):
+    ranges = {"seconds": [0.9 * seconds, 1.1 * seconds], "peak_mb": [500.0, 500.0]}
     return {
         "name": name, "group": group, "settings": [name], "repeats": 2, "seconds": seconds, "cpu_seconds": 2 * seconds,
-        "peak_mb": 500.0, "others": 0.0, "seconds_range": [0.9 * seconds, 1.1 * seconds],
+        "peak_mb": 500.0, "others": 0.0, "ranges": ranges,
         "stages": {"inverse_render": seconds}, "scores": {ERROR: error, LIKENESS: 40.0 - error}, **more,
     }  # fmt: skip
 
@@ -167,7 +168,7 @@ def test_costs_are_those_up_to_the_maps(rows):
 
 def test_repeats_become_their_median(rows):
     (found,) = summarise(rows.rows)
-    assert found["seconds"] == 20.0 and found["seconds_range"] == [15.0, 25.0] and found["repeats"] == 3
+    assert found["seconds"] == 20.0 and found["ranges"]["seconds"] == [15.0, 25.0] and found["repeats"] == 3
     assert found["stages"]["inverse_render"] == 15.0 and found["scores"][ERROR] == 1.5
 
 

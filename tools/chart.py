@@ -1,7 +1,7 @@
 """Speed against accuracy: presets, ablations, the published solver and a peer on one subject whose truth is known.
 
     python -m tools.chart SUBJECT [--cases quick|all] [--base PRESET] [--only WORD ...] [--repeats N] [--minutes M]
-                          [--work DIR] [--out DIR] [--peer-python PYTHON]
+                          [--cost NAME] [--work DIR] [--out DIR] [--peer-python PYTHON]
 
 SUBJECT  a folder with gt/ (default: the demo subject, rendered if need be).
 Does     each case from the clip to the maps, every stage in a process of its own and never two at once; presets to the
@@ -35,7 +35,7 @@ from shared.io.arrays import read_json
 from tools.demo import SUBJECT as DEMO
 from tools.tradeoff_cases import GROUPS, PEER, SETS, ChartCase, all_cases, chosen_cases
 from tools.tradeoff_page import tradeoff_page
-from tools.tradeoff_rows import Rows, pareto_front, row_costs, row_name, summarise
+from tools.tradeoff_rows import COSTS, Rows, pareto_front, row_costs, row_name, summarise
 from tools.tradeoff_runs import Runs, Solved, fingerprints
 from tools.tradeoff_scores import CODE, scores_of
 from tools.tradeoff_svg import tradeoff_svg
@@ -127,16 +127,16 @@ class Chart:
         print(f"{row['case']} ({repeat + 1}): {costs['seconds']:.1f} s, {costs['peak_mb']:.0f} MB, "
               f"dE2000 {scores.get(MEASURE, float('nan')):.3f}", flush=True)  # fmt: skip
 
-    def draw(self) -> None:
+    def draw(self, cost: str) -> None:
         """chart.svg and chart.html of the rows there are, and the front in words."""
         points = summarise(self.rows.rows)
         if not points:
             return
         groups = {name: text.format(base=self.base) for name, text in GROUPS.items()}
-        (self.out / "chart.svg").write_text(tradeoff_svg(points, MEASURE, TITLE, groups), encoding="utf-8")
-        page = tradeoff_page(points, MEASURE, self.subject.name, groups)
+        (self.out / "chart.svg").write_text(tradeoff_svg(points, MEASURE, TITLE, groups, cost), encoding="utf-8")
+        page = tradeoff_page(points, MEASURE, self.subject.name, groups, cost)
         (self.out / "chart.html").write_text(page, encoding="utf-8")
-        print("Pareto front: " + ", ".join(pareto_front(points, MEASURE)))
+        print("Pareto front: " + ", ".join(pareto_front(points, MEASURE, cost)))
         print(f"{self.out / 'chart.html'}")
 
 
@@ -152,6 +152,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--work", type=Path, default=REPOSITORY / "build" / "chart_work", help="for unfinished runs")
     found.add_argument("--out", type=Path, default=REPOSITORY / "build" / "chart", help="for the table and the chart")
     found.add_argument("--peer-python", help="a Python that has mitsuba (default: this one, where it has)")
+    found.add_argument("--cost", choices=COSTS, default="seconds", help="what the chart is drawn over")
     found.add_argument("--list", action="store_true", help="name the cases and what is measured of them, and end")
     return found
 
@@ -168,7 +169,7 @@ def main(arguments: list[str] | None = None) -> int:
                 print(f"{names}: {done} of {options.repeats}; {case.preset} {' '.join(case.settings)}")
             return 0
         chart.measure(options.repeats, options.minutes)
-        chart.draw()
+        chart.draw(options.cost)
     except InputError as error:
         print(f"chart: {error}", file=sys.stderr)
         return 2

@@ -8,19 +8,15 @@ from html import escape
 from pathlib import Path
 from string import Template
 
-from tools.tradeoff_rows import higher_is_better
+from tools.tradeoff_rows import COSTS, higher_is_better
 from tools.tradeoff_svg import GROUP_COLOURS
 
 TEMPLATE = Path(__file__).with_name("tradeoff_page.html")
-COSTS = {
-    "seconds": "seconds from the clip to the maps",
-    "cpu_seconds": "processor seconds",
-    "peak_mb": "peak memory, MB",
-    "seconds_with_export": "seconds with the export",
-}
 
 
-def tradeoff_page(points: Sequence[Mapping], measure: str, subject: str, groups: Mapping[str, str]) -> str:
+def tradeoff_page(
+    points: Sequence[Mapping], measure: str, subject: str, groups: Mapping[str, str], cost: str = "seconds"
+) -> str:
     """points: see tradeoff_rows.summarise. A page that asks for nothing outside of itself."""
     measures = sorted({name for point in points for name in point["scores"]})
     data = {
@@ -28,6 +24,7 @@ def tradeoff_page(points: Sequence[Mapping], measure: str, subject: str, groups:
         "measures": {name: higher_is_better(name) for name in measures},
         "measure": measure,
         "costs": COSTS,
+        "cost": cost,
         "groups": [[name, text, GROUP_COLOURS[name]] for name, text in groups.items()],
     }
     text = json.dumps(data, allow_nan=False).replace("</", "<\\/")

@@ -15,6 +15,12 @@ from tools.tradeoff_runs import SHOWN, Solved, current_code
 
 SCHEMA = 1
 EXPORT = "export_usd"
+COSTS = {
+    "seconds": "seconds from the clip to the maps",
+    "cpu_seconds": "processor seconds from the clip to the maps",
+    "peak_mb": "peak memory, MB",
+    "seconds_with_export": "seconds with the export",
+}
 HIGHER_IS_BETTER = ("psnr", "correlation", "within_5mm", "coverage", "ssim")
 
 
@@ -108,7 +114,7 @@ def csv_row(row: Mapping) -> dict[str, object]:
 
 
 def summarise(rows: Iterable[Mapping]) -> list[dict]:
-    """A point per case: medians of costs and scores over the repeats, and the least and the largest seconds."""
+    """A point per case: medians of costs and scores over the repeats, and the costs' ranges."""
     cases: dict[str, list[Mapping]] = {}
     for row in rows:
         cases.setdefault(row["case"], []).append(row)
@@ -117,7 +123,8 @@ def summarise(rows: Iterable[Mapping]) -> list[dict]:
         costs = [row_costs(row) for row in own]
         point = {"name": name, "group": own[0]["group"], "settings": own[0]["settings"], "repeats": len(own)}
         point |= {key: _median(costs, key) for key in costs[0]}
-        point["seconds_range"] = [min(cost["seconds"] for cost in costs), max(cost["seconds"] for cost in costs)]
+        spans = {key: [cost[key] for cost in costs if key in cost] for key in costs[0]}
+        point["ranges"] = {key: [min(values), max(values)] for key, values in spans.items()}
         walls = [{stage: cost["wall_s"] for stage, cost in row["stages"].items()} for row in own]
         point["stages"] = {stage: _median(walls, stage) for stage in walls[0]}
         point["scores"] = {key: _median([row["scores"] for row in own], key) for key in own[0]["scores"]}

@@ -8,7 +8,7 @@ from html import escape
 
 from shared.report.charts import COLOURS, nice_ticks
 from tools.tradeoff_cases import ABLATION, GROUPS, PRESET
-from tools.tradeoff_rows import pareto_front
+from tools.tradeoff_rows import COSTS, pareto_front
 
 WIDTH, HEIGHT = 860, 520
 LEFT, RIGHT, TOP, BOTTOM = 66, 24, 18, 86
@@ -41,24 +41,26 @@ def log_ticks(low: float, high: float, steps: Sequence[float] = (1, 2, 5)) -> li
     return [m * 10.0**p for p in powers for m in steps if low <= m * 10.0**p <= high]
 
 
-def tradeoff_svg(points: Sequence[Mapping], measure: str, title: str, groups: Mapping[str, str] = GROUPS) -> str:
-    """points: see tradeoff_rows.summarise; those without the measure are left out. An .svg file's text."""
-    points = [point for point in points if measure in point["scores"]]
-    seconds = [value for point in points for value in point["seconds_range"]]
+def tradeoff_svg(
+    points: Sequence[Mapping], measure: str, title: str, groups: Mapping[str, str] = GROUPS, cost: str = "seconds"
+) -> str:
+    """points: see tradeoff_rows.summarise; those without the measure or cost are left out. An .svg file's text."""
+    points = [point for point in points if measure in point["scores"] and cost in point]
+    costs = [value for point in points for value in point["ranges"][cost]]
     values = [point["scores"][measure] for point in points]
     spread = is_spread(values)
     margin = 0.08 * (max(values) - min(values)) or 0.5
     y_span = (min(values) / 1.1, max(values) * 1.1) if spread else (min(values) - margin, max(values) + margin)
-    x_span = min(seconds) / 1.25, max(seconds) * 1.25
+    x_span = min(costs) / 1.25, max(costs) * 1.25
     across = Scale(*x_span, LEFT, WIDTH - RIGHT, logarithmic=True)
     down = Scale(*y_span, HEIGHT - BOTTOM, TOP, logarithmic=spread)
-    places = {point["name"]: (across(point["seconds"]), down(point["scores"][measure])) for point in points}
-    front = pareto_front(points, measure)
+    places = {point["name"]: (across(point[cost]), down(point["scores"][measure])) for point in points}
+    front = pareto_front(points, measure, cost)
     y_ticks = log_ticks(*y_span, (1, 1.5, 2, 3, 5, 7)) if spread else nice_ticks(*y_span)
     parts = _ticks(across, down, log_ticks(*x_span), y_ticks)
-    parts += _titles(title)
+    parts += _titles(COSTS[cost], title)
     parts.append(_front([places[name] for name in front]))
-    parts += [_point(point, places[point["name"]], across) for point in points]
+    parts += [_point(point, places[point["name"]], across, cost) for point in points]
     parts += _labels(points, places, front)
     parts += _legend(groups, {point["group"] for point in points})
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}"><style>{_STYLE}</style>'
@@ -83,12 +85,12 @@ def _ticks(across: Scale, down: Scale, x_ticks: Iterable[float], y_ticks: Iterab
     return parts
 
 
-def _titles(title: str) -> list[str]:
+def _titles(below: str, beside: str) -> list[str]:
     middle, bottom = (LEFT + WIDTH - RIGHT) / 2, HEIGHT - BOTTOM
     turned = f'transform="translate(16 {(TOP + bottom) / 2}) rotate(-90)"'
     return [
-        f'<text x="{middle}" y="{bottom + 34}" text-anchor="middle">seconds from the clip to the maps</text>',
-        f'<text {turned} text-anchor="middle">{escape(title)}</text>',
+        f'<text x="{middle}" y="{bottom + 34}" text-anchor="middle">{escape(below)}</text>',
+        f'<text {turned} text-anchor="middle">{escape(beside)}</text>',
     ]
 
 
@@ -98,14 +100,14 @@ def _front(places: Sequence[tuple[float, float]]) -> str:
     return f'<path class="front" d="{path}"/>'
 
 
-def _point(point: Mapping, place: tuple[float, float], across: Scale) -> str:
+def _point(point: Mapping, place: tuple[float, float], across: Scale, cost: str) -> str:
     (x, y), colour = place, GROUP_COLOURS[point["group"]]
-    first, last = (across(value) for value in point["seconds_range"])
+    first, last = (across(value) for value in point["ranges"][cost])
     radius = 6.5 if point["group"] == PRESET else 4
-    seconds = f"{point['name']}: {point['seconds']:.0f} s"
+    words = f"{point['name']}: {point[cost]:.0f}"
     return (
         f'<path class="range" stroke="{colour}" d="M{first:.1f} {y:.1f}H{last:.1f}"/>'
-        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius}" fill="{colour}"><title>{escape(seconds)}</title></circle>'
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius}" fill="{colour}"><title>{escape(words)}</title></circle>'
     )
 
 
