@@ -7,7 +7,8 @@ Limn solves from. Writes OUT/<seconds>/ with maps/, envmap.exr, poses.npz, mesh.
 after so many seconds of the solve (start-up and compilation count, writing does not).
 Unknown: albedo, specular intensity, roughness and the light, in the model that Limn solves. Method: path replay
 backpropagation (Vicini et al., SIGGRAPH 2021) with one bounce; Adam on one frame per step, the light's radiance in the
-logarithm. Needs mitsuba with its LLVM variant (DRJIT_LIBLLVM_PATH names libLLVM where it is not found).
+logarithm; the result is the iterates' running mean. Needs mitsuba with its LLVM variant (DRJIT_LIBLLVM_PATH names
+libLLVM where it is not found).
 """
 
 from __future__ import annotations
@@ -43,6 +44,9 @@ START_SPECULAR, START_ROUGHNESS = 0.7, 0.45
 """Where Limn starts from, too."""
 WHITE_SIGMA, CLIPPED = 0.15, 0.99
 RATES = {"light": 0.05, "albedo": 0.02, "specular_intensity": 0.02, "roughness": 0.01}
+AVERAGING = 8.0
+"""The result is the mean of the iterates, later ones weighing more, so that their noise does not stay in it (Shamir and
+Zhang, ICML 2013)."""
 RANGES = {"albedo": (0.0, 1.0), "specular_intensity": (0.0, 2.0), "roughness": (0.08, 1.0)}
 
 
@@ -71,6 +75,7 @@ class PeerSolver:
         for name, key in self.keys.items():
             self.optimiser[name] = self.params[key]
         self.optimiser.set_learning_rate(dict(RATES))
+        self.average = {name: self.dr.detach(self.optimiser[name]) for name in RATES}
         self._pictures: dict[int, tuple] = {}
 
     def _bsdf(self, start: Start) -> dict:
@@ -124,11 +129,15 @@ class PeerSolver:
         for name, (low, high) in RANGES.items():
             self.optimiser[name] = dr.clip(self.optimiser[name], low, high)
         self.iteration += 1
+        share = (AVERAGING + 1.0) / (self.iteration + AVERAGING)
+        for name, mean in self.average.items():
+            self.average[name] = mean + share * (dr.detach(self.optimiser[name]) - mean)
+        dr.eval(self.average)
         return float(np.array(loss).ravel()[0])
 
     def maps(self) -> dict[str, np.ndarray]:
         """diffuse_albedo [S, S, 3], specular_intensity and roughness [S, S] float32."""
-        found = {name: np.array(self.optimiser[name]) for name in RANGES}
+        found = {name: np.array(self.average[name]) for name in RANGES}
         albedo = found["albedo"].astype(np.float32)
         size = (len(albedo), len(albedo))
         gloss, rough = (cv2.resize(found[name][..., 0], size) for name in ("specular_intensity", "roughness"))
@@ -138,12 +147,13 @@ class PeerSolver:
         """Starts from a light [LIGHT_HEIGHT, 2 LIGHT_HEIGHT, 3] in the layout of shared.envmap."""
         ends = np.arange(LIGHT_HEIGHT) / (LIGHT_HEIGHT - 1) * LIGHT_HEIGHT - 0.5
         data = _rows_at(np.clip(ends, 0.0, LIGHT_HEIGHT - 1.0), latlong)
-        self.optimiser["light"] = self.mi.TensorXf(np.log(np.maximum(data, 1e-6)).astype(np.float32))
+        self.average["light"] = self.mi.TensorXf(np.log(np.maximum(data, 1e-6)).astype(np.float32))
+        self.optimiser["light"] = self.average["light"]
 
     def light(self) -> np.ndarray:
         """Lat-long radiance in the layout of shared.envmap, whose rows end half a row before the poles."""
         middles = (np.arange(LIGHT_HEIGHT) + 0.5) / LIGHT_HEIGHT * (LIGHT_HEIGHT - 1)
-        return _rows_at(middles, np.exp(np.array(self.optimiser["light"])))
+        return _rows_at(middles, np.exp(np.array(self.average["light"])))
 
 
 def _rows_at(rows: np.ndarray, image: np.ndarray) -> np.ndarray:
