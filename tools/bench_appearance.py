@@ -7,7 +7,7 @@
 
 SUBJECT: a folder with gt/; RUN: a run's folder whose work/ holds sample_frames and track_landmarks. True mesh and poses
 are used unless --tracked. --with: another clip of the same head in another light, solved together with the first one,
-on whose truth the result is measured. Each case solves the clip anew with some models switched off, and is compared
+each of them measured on its own truth. Each case solves the clip anew with some models switched off, and is compared
 with the truth: albedo (dE2000 after one gain per channel, and raw), specular intensity and roughness where confidence
 is over one half, light through a 25 degree lobe, and re-renders against the video on the face skin, on fitted and on
 held-out frames.
@@ -199,32 +199,35 @@ def render_errors(subject: Path, inputs: ClipInputs, result: InverseResult) -> d
 
 
 def measure(
-    subject: Path,
+    subjects: Sequence[Path],
     clips: Sequence[ClipInputs],
-    index: np.ndarray,
     changes: dict,
     note: Callable,
     textures: Sequence[MeanTexture] = (),
 ) -> tuple[dict, object]:
-    """Solves one case and compares it with the first clip's truth -> scores and the result; index [F]: its frames."""
+    """Solves one case and compares it with the truth of each clip's subject -> scores and the result."""
     start = time.perf_counter()
     job = _Job(changes)
-    inputs, sights = clips[0], clips[0].chart_sights() if job.params.chart else ()
-    together = inputs
+    inputs = join_clips(clips, textures) if len(clips) > 1 else clips[0]
     if len(clips) > 1:
-        together = join_clips(clips, textures)
-        inputs = replace(inputs, camera_from_head=together.camera_from_head[: len(index)])
-        note(f"clips in one head space: {together.describe()}")
-    result = solve_clip(together, read_settings(job), silent, note, sights)
+        note(f"clips in one head space: {inputs.describe()}")
+    sights = inputs.chart_sights() if job.params.chart else ()
+    result = solve_clip(inputs, read_settings(job), silent, note, sights)
     scores = {"seconds": time.perf_counter() - start}
     scores["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    scores |= map_errors(subject, inputs, index, result.viewer.mesh, result.maps)
-    light = np.split(result.solution.state.light, len(clips))[0]
-    scores |= light_errors(subject, latlong_from_cube(light, 128))
-    has_relight = (subject / "relight").is_dir()
-    relit = relight_errors(subject, result, settings_of(changes), inputs.camera_from_head, index) if has_relight else {}
-    scores |= {f"relight_{name}": [errors["psnr"], errors["psnr_gain"]] for name, errors in relit.items()}
-    return scores | render_errors(subject, inputs, result), result
+    placed = [replace(clip, camera_from_head=inputs.camera_from_head[inputs.light_index == k])
+              for k, clip in enumerate(clips)]
+    lights = np.split(result.solution.state.light, len(clips))
+    each = [map_errors(subject, clip, clip.frame_index, result.viewer.mesh, result.maps)
+            | light_errors(subject, latlong_from_cube(light, 128))
+            for subject, clip, light in zip(subjects, placed, lights, strict=True)]
+    scores |= each[0] | ({"other": each[1]} if len(clips) > 1 else {})
+    first, clip = subjects[0], placed[0]
+    if (first / "relight").is_dir():
+        poses, settings = clip.camera_from_head, settings_of(changes)
+        relit = relight_errors(first, result, settings, poses, clip.frame_index)
+        scores |= {f"relight_{name}": [errors["psnr"], errors["psnr_gain"]] for name, errors in relit.items()}
+    return scores | render_errors(first, clip, result), result
 
 
 class LargeClip:
@@ -281,27 +284,25 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="folder for the maps of each case")
     parser.add_argument("--cost", action="store_true", help="times over sizes instead of accuracy")
     options = parser.parse_args(arguments)
-    inputs, index = open_clip(options.subject, options.run, options.tracked)
-    clips, textures = [inputs], []
-    if options.other:
-        clips.append(open_clip(*options.other, options.tracked)[0])
-        runs = options.run, options.other[1]
+    pairs = [(options.subject, options.run), *([options.other] if options.other else [])]
+    clips, textures = [open_clip(*pair, options.tracked)[0] for pair in pairs], []
+    if options.other and options.tracked:
         textures = [read_mean_texture(run / "work" / "init_albedo", clip.mesh)
-                    for run, clip in zip(runs, clips, strict=True) if options.tracked]
-    given = dict(setting.split("=", 1) for setting in options.set)
+                    for (_, run), clip in zip(pairs, clips, strict=True)]
+    subjects, given = [subject for subject, _ in pairs], dict(setting.split("=", 1) for setting in options.set)
     if options.cost:
-        cost_table(inputs, given)
+        cost_table(clips[0], given)
         return 0
     for case in options.cases:
-        scores, result = measure(options.subject, clips, index, {**given, **CASES[case]}, print, textures)
+        scores, result = measure(subjects, clips, {**given, **CASES[case]}, print, textures)
         rounded = {key: round(value, 4) if isinstance(value, float) else value for key, value in scores.items()}
         print(case, json.dumps(rounded))
         if options.out:
-            save(options.out / case, inputs, result)
+            save(options.out / case, result)
     return 0
 
 
-def save(folder: Path, inputs: ClipInputs, result: InverseResult) -> None:
+def save(folder: Path, result: InverseResult) -> None:
     """Maps as arrays, for looking at."""
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(folder / "maps.npz", light=result.solution.state.light, **result.maps)

@@ -2,8 +2,9 @@
 
 Each clip was tracked by itself, so that it has a head space, a size and a shape of its own. The mesh is that of the
 clip whose tracks know depth best. For the others their mean textures say which skin lies where on it: what a frame
-showed at some pixel of its own clip's mesh, the shared mesh has to show there, too, and that is a pose from many named
-points for each frame. Depth that one clip got wrong does not enter: only where its mesh put the skin in the pictures.
+showed at some pixel of its own clip's mesh, the shared mesh has to show there, too. One turn, shift and size of the
+head for all frames of a clip are solved from that, in the pictures: what depth the clip got wrong does not enter, and
+its own motion, which is far steadier than poses one by one, stays as it was.
 """
 
 from __future__ import annotations
@@ -13,21 +14,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shared.bundle import resect
-from shared.bundle_problem import Tracks
 from shared.chart import ChartSight
 from shared.errors import InputError
 from shared.gather import Picture
-from shared.geometry import Similarity, camera_centres, project, similarity_from_points
+from shared.geometry import (
+    Similarity,
+    camera_centres,
+    project,
+    rotation_from_vector,
+    similarity_from_points,
+)
 from shared.mesh import Mesh, normalised
 from shared.solve.reshape import track_points
+from shared.solve.shape_samples import projection_slope
 from shared.texture_match import Matches, MeanTexture, match_textures
 
 MATCHES, LEAST_MATCHES = 2000, 300
 """Texels that a pose is solved from, and fewer than which show that the clips have no skin in common."""
 FACING = 0.4
 """Cosine of the angle between normal and line of sight from which on a frame shows a texel well."""
-NOISE_PX = 0.5
+LOSS_PX, ITERATIONS = 1.0, 30
 
 
 @dataclass(frozen=True)
@@ -104,6 +110,36 @@ def join_clips(clips: Sequence, textures: Sequence[MeanTexture]) -> JointInputs:
     )
 
 
+def fit_similarity(
+    points: np.ndarray, pixels: np.ndarray, camera_from_own: np.ndarray, intrinsics: np.ndarray, start: Similarity
+) -> Similarity:
+    """own ~ similarity(points [N, 3]) such that poses [F, 4, 4] of the own space show them at pixels [F, N, 2].
+
+    Robust Gauss-Newton (Cauchy); NaN: not seen.
+    """
+    found = start
+    for _ in range(ITERATIONS):
+        own = found.points(points)
+        centre, matrix, right = own.mean(0), np.zeros((7, 7)), np.zeros(7)
+        arm = own - centre
+        turns = np.stack([np.cross(axis, arm) for axis in np.eye(3)], axis=-1)
+        motion = np.concatenate([turns, np.broadcast_to(np.eye(3), turns.shape), arm[..., None]], axis=2)
+        for pose, seen in zip(camera_from_own, pixels, strict=True):
+            error = seen - project(own, pose, intrinsics)[0]
+            known = np.isfinite(error[:, 0])
+            error, rows = error[known], projection_slope(own[known], pose, intrinsics) @ motion[known]
+            weight = 1.0 / (1.0 + np.square(error / LOSS_PX).sum(1))
+            matrix += np.einsum("n,nki,nkj->ij", weight, rows, rows)
+            right += np.einsum("n,nki,nk->i", weight, rows, error)
+        step = np.linalg.solve(matrix, right)
+        turn, grow = rotation_from_vector(step[:3]), float(np.exp(step[6]))
+        place = centre + step[3:6] + grow * turn @ (found.translation - centre)
+        found = Similarity(grow * found.scale, turn @ found.rotation, place)
+        if np.abs(step[:3]).max() < 1e-6:
+            break
+    return found
+
+
 def depth_deviation(clip) -> float:
     """Median standard deviation of a clip's track points in depth, mm."""
     return float(np.median(track_points(*clip.tracks, clip.camera_from_head, clip.intrinsics).sigma_mm))
@@ -128,8 +164,9 @@ def place(main, clip, matches: Matches) -> Placed:
     pixels = project(chosen.second, poses, clip.intrinsics)[0]
     towards = normalised(camera_centres(poses)[:, None] - chosen.second)
     pixels[(towards * chosen.normals).sum(-1) < FACING] = np.nan
-    start = Similarity(*similarity_from_points(chosen.second, chosen.first)).pose(poses)
-    tracks = Tracks.of_equal_noise(pixels, NOISE_PX)
-    found, _ = resect(tracks, start, chosen.first, clip.intrinsics, loss_scale=2.0, iterations=20)
+    start = Similarity(*similarity_from_points(chosen.first, chosen.second))
+    own = fit_similarity(chosen.first, pixels, poses, clip.intrinsics, start)
+    back = Similarity(1.0 / own.scale, own.rotation.T, -own.rotation.T @ own.translation / own.scale)
+    found = back.pose(poses)
     away = np.linalg.norm(project(chosen.first, found, clip.intrinsics)[0] - pixels, axis=-1)
     return Placed(found, len(matches), float(np.nanmedian(away)))
