@@ -127,6 +127,8 @@ CHECKPOINT = "inverse_render.checkpoint.npz"
 LATLONG_HEIGHT = 128
 SPECULAR_SPREAD = 0.25
 """Standard deviation of the logarithm of people's mean specular intensity about the expected one."""
+FAR_PX = 1.5
+"""Median distance of a clip's skin from where the shared mesh shows it, from which on the clips do not go together."""
 FLAT_NORMALS = "flat: this version solves no fine normals"
 
 
@@ -284,16 +286,19 @@ def run(job: Job) -> None:
     from shared.solve.reshape import segments_of
 
     clips = read_clips(job)
-    inputs = clips[0]
+    inputs, placed = clips[0], []
     if job.clips:
         textures = [read_mean_texture(job.input("init_albedo", name), clip.mesh)
                     for name, clip in zip(job.clips, clips, strict=True)]
         inputs = join_clips(clips, textures)
-        job.note(f"clips in one head space: {inputs.describe()}")
+        placed = [{"name": name, **facts} for name, facts in zip(job.clips, inputs.describe(), strict=True)]
+        job.note(f"clips in one head space: {placed}")
     sights = inputs.chart_sights() if job.params.chart else ()
     settings = read_settings(job, job.out.parent / CHECKPOINT)
     result = solve_clip(inputs, settings, job.progress, job.note, sights)
     record = summarise(inputs, result)
+    record["warnings"] += [f"clip {clip['name']} lies {clip['match_px']:.1f} px beside the shared mesh: other lens, "
+                           "another expression?" for clip in placed if clip.get("match_px", 0.0) > FAR_PX]
     for text in record["warnings"]:
         job.warn(text)
     write_maps(job, result)
@@ -306,8 +311,7 @@ def run(job: Job) -> None:
         own.append(write_clip(job, folder, clip, rows[0], result, lights[k], inputs.camera_from_head[rows]))
     record |= own[0]
     if job.clips:
-        described = zip(job.clips, inputs.describe(), own, strict=True)
-        record["clips"] = [{"name": name, **placed, **frames} for name, placed, frames in described]
+        record["clips"] = [clip | frames for clip, frames in zip(placed, own, strict=True)]
     if rungs := record.get("ladder"):
         write_json(job.out / LADDER_SECONDS, [rung.pop("seconds") for rung in rungs])
     write_json(job.out / "solve.json", record)

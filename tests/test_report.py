@@ -291,6 +291,7 @@ def test_gathering_of_warnings_and_left_out_frames(tmp_path):
          "Correct capture.moves"),
         ("the colour chart in frame 6 is not used: its grey patches are overexposed: expose darker", "chart.png"),
         ("3 edges join faces of opposite winding", "Clean the mesh"),
+        ("clip sun lies 2.1 px beside the shared mesh: other lens, another expression?", "its own lens"),
     ],
 )
 def test_every_warning_gets_its_advice(warning, words):

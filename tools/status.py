@@ -13,7 +13,7 @@ from tools.housekeeping import folder_size, readable_size
 from tools.plan import CURRENT, StagePlan
 from tools.watch import Track
 
-HEADER = f"  {'stage':16} {'state':9} {'size':>10} {'seconds':>8} {'peak':>9}  {'started':25}  folder"
+HEADER = f"{'state':9} {'size':>10} {'seconds':>8} {'peak':>9}  {'started':25}  folder"
 
 
 def status_of(case: Case, plans: Mapping[str, StagePlan]) -> dict[str, object]:
@@ -54,15 +54,17 @@ def running_stages(case: Case) -> Iterator[Track]:
 
 def status_lines(record: Mapping) -> list[str]:
     """The record for people."""
-    lines = [f"{record['subject']}: {record['results']}" + "; a run works on it" * record["running"], HEADER]
+    width = max(16, *(len(stage["stage"]) for stage in record["stages"]))
+    lines = [f"{record['subject']}: {record['results']}" + "; a run works on it" * record["running"],
+             f"  {'stage':{width}} {HEADER}"]
     for stage in record["stages"]:
         size = readable_size(stage["bytes"]) if stage["bytes"] is not None else "-"
         seconds = f"{stage['seconds']:.1f}" if stage["seconds"] is not None else "-"
         peak = f"{stage['peak_memory_mb']:.0f} MB" if stage["peak_memory_mb"] is not None else "-"
-        lines.append(f"  {stage['stage']:16} {stage['state']:9} {size:>10} {seconds:>8} {peak:>9}  "
+        lines.append(f"  {stage['stage']:{width}} {stage['state']:9} {size:>10} {seconds:>8} {peak:>9}  "
                      f"{stage['started'] or '-':25}  {stage['folder'] or '-'}")
         if stage["progress"]:
-            lines.append(f"  {'':16} since {stage['running_s']:.0f} s: {stage['progress']}")
+            lines.append(f"  {'':{width}} since {stage['running_s']:.0f} s: {stage['progress']}")
         if stage["failed_log"]:
-            lines.append(f"  {'':16} failed: {stage['failed_log']}")
+            lines.append(f"  {'':{width}} failed: {stage['failed_log']}")
     return lines + [f"  review: {flag}" for flag in record["flags"]]

@@ -16,6 +16,8 @@ _ADVICE = (
      "overexposed patches or the head's shadow; or give its corners by `chart:` in subject.yaml."),
     (r"tracks ask for a focal length",
      "Correct the lens in subject.yaml; cropping and stabilisation in the camera lengthen it too."),
+    (r"beside the shared mesh",
+     "Give each clip its own lens in subject.yaml, and clips with one neutral expression; else solve them one by one."),
     (r"focal|lens|sensor", "Give the lens in subject.yaml (camera: focal_length_mm and sensor_width_mm)."),
     (r"faces in the clip",
      "Look at the contact sheet; if it shows the wrong person, crop the clip or film one person."),
