@@ -1,16 +1,21 @@
 """The ladder of models: the rule by which a rung is climbed, and where it ends on captures whose truth is known."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from toy_capture import NOISE, even_light, hard_light, make_truth
+from test_local_roughness import glossy_forehead, solver_under_true_light
+from toy_capture import NOISE, ROUGHNESS, even_light, hard_light, make_truth
+from toy_head import toy_head
 
 from shared.errors import InputError
 from shared.report.gather import ladder_record
 from shared.report.model_sections import climbed_table
 from shared.solve.appearance import Settings
-from shared.solve.ladder import LIGHTS, Ladder, Model, allowed_rungs, gain, serves
+from shared.solve.fit_appearance import Solution
+from shared.solve.ladder import LIGHTS, Ladder, Model, Trial, allowed_rungs, gain, serves
+from shared.solve.ladder_gloss import VARIATIONS, Gloss, GlossLadder, segments_at
 from stages.inverse_render import STAGE, read_forced, read_settings
 
 CAREFUL = Settings(resolutions=(8, 16), noise=(0.003, 0.01))
@@ -62,6 +67,46 @@ def test_every_rung_is_on_the_record_with_its_error_and_seconds(glossy):
         held_out = record["held_out"] if record["climbed"] else held_out
     assert held_out == pytest.approx(float(ladder.present.errors.mean()))
     assert len(ladder.tried) == len(records)  # no model twice
+
+
+def gloss_of(capture, segment, **rungs):
+    """The variation of gloss that is climbed to under the true light, and the record."""
+    model, records = Model("bounces", "one_value", "cubemap_16"), []
+    settings = model.applied(Settings(noise=(0.003, 0.01), roughness=ROUGHNESS))
+    state = solver_under_true_light(capture).state
+    trial = Trial(model, Solution(state, (), 0.0, 0.0), np.zeros(0), 0.0)
+    allowed = {"specular": VARIATIONS, "roughness": VARIATIONS} | rungs
+    return GlossLadder(capture, settings, trial, segment, allowed, records.append).climb(), records
+
+
+def test_gloss_that_differs_by_segment_is_found_and_worn(one_thread):
+    capture = make_truth(roughness_at=glossy_forehead)[0]
+    height = capture.points.positions[:, 1]
+    forehead = (height > np.median(height)).astype(int)
+    gloss, records = gloss_of(capture, forehead, specular=("one_value",))
+    assert gloss.roughness == "by_segment" and gloss.specular == "one_value"
+    assert [record["rung"] for record in records] == ["by_segment", "local"]
+    solution = Solution(solver_under_true_light(capture).state, (), 0.0, 0.0)
+    worn = gloss.worn_by(replace(solution, state=replace(solution.state, roughness=1.1 * ROUGHNESS)))
+    found = worn.gloss.roughness(capture.points.positions)
+    assert len(np.unique(found.round(9))) == 2 and worn.local_specular is None
+    assert found[forehead == 1].mean() < 0.93 * 1.1 * ROUGHNESS < 1.05 * 1.1 * ROUGHNESS < found[forehead == 0].mean()
+
+
+def test_one_gloss_everywhere_stays_one(one_thread):
+    capture = make_truth()[0]
+    segment = (capture.points.positions[:, 0] > 0.0).astype(int)
+    gloss, records = gloss_of(capture, segment)
+    assert gloss == Gloss() and len(records) == 4
+    assert gloss.worn_by(Solution(None, (), 0.0, 0.0)).gloss is None
+
+
+def test_points_take_the_segment_of_the_surface_next_to_them():
+    mesh = toy_head(3).mesh(np.zeros(2), np.zeros(1))
+    right = (mesh.vertices[mesh.faces].mean(1)[:, 0] > 0.0).astype(np.uint8)
+    far = np.abs(mesh.vertices[:, 0]) > 30.0
+    assert (segments_at(mesh, right, mesh.vertices[far]) == (mesh.vertices[far, 0] > 0.0)).all()
+    assert segments_at(mesh, None, mesh.vertices) is None
 
 
 def test_a_ladder_goes_on_where_it_stands(glossy):

@@ -33,7 +33,8 @@ ROUGHNESS_SEARCHES = (2, 1)
 class Solution:
     """The best State by held-out residual; iterations: one record per step; fitted and held_out: its residuals; gloss:
     where roughness varies over the skin, how, and gloss_record what the held-out frames said to that; trusted: whether
-    highlights took part to the end; frame_errors [F]: each frame's mean absolute residual."""
+    highlights took part to the end; frame_errors [F]: each frame's mean absolute residual; local_specular: where the
+    specular intensity varies with the face's segments, how."""
 
     state: State
     iterations: tuple[dict, ...]
@@ -43,6 +44,7 @@ class Solution:
     gloss_record: dict = field(default_factory=dict)
     trusted: bool = True
     frame_errors: np.ndarray | None = None
+    local_specular: GlossEquations | None = None
 
 
 def fit_appearance(

@@ -70,7 +70,8 @@ class InverseSettings:
 
     shape: how the mesh is refined, None: it stays as it is; fit_frames: how many frames to fit, chosen to cover the
     face, 0: all but those held out; reference: solve by the published algorithm instead; ladder: choose the model, up
-    to what the settings say, and leave only the named parts of it as they say."""
+    to what the settings say, and leave only the named parts of it as they say; specular_widths: over which, relative
+    to the map, texels share their specular intensity: what held-out frames choose from."""
 
     sizes: Sizes = field(default_factory=Sizes)
     appearance: Settings = field(default_factory=Settings)
@@ -81,6 +82,7 @@ class InverseSettings:
     fit_frames: int = 0
     reference: ReferenceSettings | None = None
     ladder: frozenset[str] | None = None
+    specular_widths: tuple[float, ...] = (np.inf, 1 / 16, 1 / 64)
 
 
 @dataclass(frozen=True)
@@ -139,8 +141,8 @@ def solve_clip(
     surface = TexelSurface(inputs.mesh, settings.map_size)
     clip = Clip(inputs.picture, inputs.camera_from_head, inputs.intrinsics, fitted, inputs.light_index)
     typical = np.median(solution.state.albedo, axis=0)
-    texture = TexturePass(surface, viewer, shading, clip, solution.state.specular, typical, progress=progress)
-    widths = (np.inf, settings.map_size / 16, settings.map_size / 64) if settings.appearance.specular else (np.inf,)
+    texture = TexturePass(surface, viewer, shading, clip, specular_at(surface, solution), typical, progress=progress)
+    widths = settings.map_size * np.array(settings.specular_widths if settings.appearance.specular else (np.inf,))
     material, texture_record = texture.run(widths)
     gloss = solution.gloss
     roughness = solution.state.roughness if gloss is None else gloss.roughness(inputs.mesh.vertices)
@@ -155,12 +157,12 @@ def solve_light(
     inputs: InverseInputs, settings: InverseSettings, viewer: SurfaceViewer, fitted, chart, progress, note
 ) -> LitClip:
     """Light and mesh: those of the full model, or of the one that the ladder leads to."""
-    start, tracked, shape_record, rungs = None, None, {"refined": False}, ()
+    start, gloss, tracked, shape_record, rungs = None, None, None, {"refined": False}, ()
     if settings.ladder is not None:
         from shared.solve.ladder_clip import climb
 
         climbed = climb(inputs, settings, fitted, chart, progress, note)
-        inputs, settings, start = climbed.inputs, climbed.settings, climbed.start
+        inputs, settings, start, gloss = climbed.inputs, climbed.settings, climbed.start, climbed.gloss
         shape_record, rungs = climbed.shape_record, climbed.rungs
         viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
     scenery = set_scenery(viewer, settings.sizes, settings.appearance.visibility)
@@ -178,6 +180,7 @@ def solve_light(
         if shape_record["refined"]:
             inputs, viewer, scenery = reshaped, viewer_then, scenery_then
             solution, capture = then, capture_then
+    solution = solution if gloss is None else gloss.worn_by(solution)
     return LitClip(inputs, settings, viewer, scenery, capture, solution, shape_record, rungs, tracked)
 
 
@@ -295,6 +298,13 @@ def shade_vertices(
     )
 
 
+def specular_at(surface: TexelSurface, solution: Solution) -> float | np.ndarray:
+    """The specular intensity that texels start from: one, or each its own [T]."""
+    if solution.local_specular is None:
+        return solution.state.specular
+    return np.clip(solution.local_specular.specular_at(surface.interpolate(surface.mesh.vertices)), 0.0, 2.0)
+
+
 def make_maps(surface: TexelSurface, material: TexelMaterial, roughness: float | np.ndarray) -> dict[str, np.ndarray]:
     """UV-space images with filled gutters; roughness: one, or each vertex's [V]; confidence is the share of the prior's
     variance that the clip removed."""
@@ -318,7 +328,7 @@ def summarise(inputs: InverseInputs, result: InverseResult) -> dict:
         "model": {
             "light": describe_light(state),
             "specular_intensity": round(state.specular, 4),
-            "specular_variation": result.record["texture"]["chosen"],
+            "specular_variation": "by segment" if solution.local_specular else result.record["texture"]["chosen"],
             "roughness": round(state.roughness, 4),
             "roughness_variation": solution.gloss_record,
             "moves": inputs.moves,

@@ -3,8 +3,10 @@
 Each part of the model has rungs of its own, from the least to the most:
 
     visibility  off, on, bounces
-    specular    none, one_value
+    specular    none, one_value; by_segment, local (ladder_gloss)
     light       harmonics_2, sun_sky, harmonics_4, cubemap_8, cubemap_16, cubemap_32
+    geometry    tracked, refined, subdivided (ladder_clip)
+    roughness   one_value; by_segment, local (ladder_gloss)
 
 The climb starts at the bottom of all and tries the next rung of one part after the other, each from the solution
 below it, until no part climbs any more. A rung is climbed if the mean absolute error on held-out frames, paired frame
@@ -40,7 +42,7 @@ VISIBILITIES = ("off", "on", "bounces")
 SPECULARS = ("none", "one_value")
 WORTHWHILE = 0.005
 """Share of the error that a rung must save besides: as much as the solver leaves when it stops."""
-PARTS = ("visibility", "specular", "light", "geometry")
+PARTS = ("visibility", "specular", "light", "geometry", "roughness")
 """What can be forced."""
 FEWEST_HELD_OUT = 3
 """Frames, below which differences between them have no standard error."""

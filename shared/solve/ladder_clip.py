@@ -14,6 +14,7 @@ from shared.solve.capture import Sizes, hold_out, set_scenery, spread_frames
 from shared.solve.fit_appearance import Solution
 from shared.solve.inverse import InverseInputs, InverseSettings, capture_skin, frames_of
 from shared.solve.ladder import FEWEST_HELD_OUT, Ladder, allowed_rungs, describe, serves
+from shared.solve.ladder_gloss import POOLING, VARIATIONS, Gloss, GlossLadder, segments_at
 from shared.solve.reshape import reshape
 from shared.solve.shape import Reflectance, ShapeSettings
 
@@ -24,12 +25,13 @@ CLIMB_FRAMES, CLIMB_HOLD_OUT = 36, 3
 
 @dataclass(frozen=True)
 class Climbed:
-    """The clip with the mesh that was chosen, what is left to solve, a solution to start from, what became of the mesh,
-    and the record of the rungs."""
+    """The clip with the mesh that was chosen, what is left to solve, a solution to start from, how its gloss varies,
+    what became of the mesh, and the record of the rungs."""
 
     inputs: InverseInputs
     settings: InverseSettings
     start: Solution | None = None
+    gloss: Gloss | None = None
     shape_record: dict = field(default_factory=lambda: {"refined": False})
     rungs: tuple[dict, ...] = ()
 
@@ -86,13 +88,18 @@ class _Climber:
         self.held_out = int((~self.small.captures[True].fitted).sum())
         self.ladder = self._ladder(self.small)
         self.shape_record: dict = {"refined": False}
+        self.gloss = Gloss()
 
     def climb(self) -> None:
-        """All parts; the result stands in small and ladder.present."""
+        """All parts; the result stands in small, ladder.present and gloss."""
         self.ladder.climb()
-        shape, before = self.settings.shape, self.ladder.present
-        if shape is None or self.small.inputs.face_segment is None:
-            return
+        if self.settings.shape is not None and self.small.inputs.face_segment is not None:
+            self._climb_geometry(self.settings.shape)
+        if self.ladder.present.model.specular != "none":
+            self._climb_gloss()
+
+    def _climb_geometry(self, shape: ShapeSettings) -> None:
+        before = self.ladder.present
         for subdivisions in range(shape.subdivisions + 1):
             if not self._refine(replace(shape, subdivisions=subdivisions)):
                 break
@@ -101,6 +108,15 @@ class _Climber:
             residuals = {"before": float(before.errors.mean()), "after": float(after.errors.mean())}
             self.shape_record = {"refined": True, "held_out": residuals}
             self.ladder.climb()
+
+    def _climb_gloss(self) -> None:
+        present, inputs, settings = self.ladder.present, self.small.inputs, self.settings.appearance
+        capture = self.small.captures[present.model.visibility != "off"]
+        segment = segments_at(inputs.mesh, inputs.face_segment, capture.points.positions)
+        free = {"specular": True, "roughness": settings.local_roughness}
+        rungs = {part: VARIATIONS[: 3 if free[part] and part not in self.forced else 1] for part in free}
+        applied = present.model.applied(settings)
+        self.gloss = GlossLadder(capture, applied, present, segment, rungs, self._report).climb()
 
     def _refine(self, shape: ShapeSettings) -> bool:
         """Refines the tracked mesh, or goes on refining it, under the present solution; kept where that serves."""
@@ -137,6 +153,10 @@ class _Climber:
 
     def climbed(self) -> Climbed:
         """What is left to solve."""
-        present = self.ladder.present
-        settings = replace(self.settings, appearance=present.model.applied(self.settings.appearance), shape=None)
-        return Climbed(self.small.inputs, settings, present.solution, self.shape_record, tuple(self.rungs))
+        present, settings, forced = self.ladder.present, self.settings, self.forced
+        appearance = present.model.applied(settings.appearance)
+        appearance = replace(appearance, local_roughness=appearance.local_roughness and "roughness" in forced)
+        widths = settings.specular_widths if "specular" in forced else POOLING[self.gloss.specular]
+        settings = replace(settings, appearance=appearance, shape=None, specular_widths=widths)
+        found = self.gloss, self.shape_record, tuple(self.rungs)
+        return Climbed(self.small.inputs, settings, present.solution, *found)

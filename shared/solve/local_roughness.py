@@ -92,7 +92,7 @@ def local_roughness(solver: AppearanceSolver) -> tuple[GlossEquations | None, di
     model = solver.model(irradiance, reflection)
     weight = solver.weights(model)
     solver.measure_misfit(model, weight)
-    equations = _gather(solver, irradiance, weight * solver.fitted)
+    equations = gloss_equations(solver, irradiance, weight * solver.fitted)
     specular = torch.from_numpy(equations.specular_at(equations.positions).astype(np.float32))[None, :, None]
     local = np.maximum(equations.roughness(equations.positions), solver.table.narrowest)
     errors = {}
@@ -114,7 +114,7 @@ def local_roughness(solver: AppearanceSolver) -> tuple[GlossEquations | None, di
     return (equations if kept else None), record
 
 
-def _gather(solver: AppearanceSolver, irradiance: torch.Tensor, weight: torch.Tensor) -> GlossEquations:
+def gloss_equations(solver: AppearanceSolver, irradiance: torch.Tensor, weight: torch.Tensor) -> GlossEquations:
     """The equations under fixed light, albedo eliminated; weight [3, P, F] of the samples that take part."""
     state, (mean, spread) = solver.state, solver.settings.specular_prior
     logs = np.log(state.roughness) + np.log(FACTOR) * np.arange(-STEPS, STEPS + 1)

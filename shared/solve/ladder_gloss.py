@@ -1,0 +1,133 @@
+"""The ladder's upper rungs: specular intensity and roughness that vary over the skin, by face segment or locally.
+
+Under the light that was found, the points' equations of gloss (local_roughness) are summed over all of the skin, over a
+face segment, or over a neighbourhood. Albedo is eliminated anew each time; held-out frames decide as on every rung.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from shared.mesh import Mesh
+from shared.solve.appearance import AppearanceSolver, Capture, Settings
+from shared.solve.fit_appearance import Solution
+from shared.solve.ladder import LOOK_AHEAD, Trial, describe, serves
+from shared.solve.local_roughness import GlossEquations, gloss_equations
+
+VARIATIONS = ("one_value", "by_segment", "local")
+POOLING = {"one_value": (np.inf,), "by_segment": (np.inf,), "local": (1 / 16, 1 / 64)}
+"""Widths, relative to the map, over which texels share their specular intensity."""
+
+
+@dataclass(frozen=True)
+class SegmentGloss(GlossEquations):
+    """Equations summed over face segments; segment [P] of each point."""
+
+    segment: np.ndarray | None = None
+
+    def _pooled(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Curvature and moment [N, R] of the segments of positions [N, 3], with the intensity's prior."""
+        own = self.segment[cKDTree(self.positions).query(positions)[1]]
+        mean, precision = self.specular
+        curvature, moment = (
+            np.stack([np.bincount(self.segment, row) for row in values], axis=1)[own]
+            for values in (self.curvature, self.moment)
+        )
+        return curvature + precision, moment + precision * mean
+
+
+@dataclass(frozen=True)
+class Gloss:
+    """How specular intensity and roughness vary: the rungs, and the equations behind them (None: one value)."""
+
+    specular: str = "one_value"
+    roughness: str = "one_value"
+    specular_equations: GlossEquations | None = None
+    roughness_equations: GlossEquations | None = None
+
+    def worn_by(self, solution: Solution) -> Solution:
+        """A solution of the same model, with roughness and specular intensity that vary about its own values."""
+        state, found = solution.state, {}
+        for name, equations in (("gloss", self.roughness_equations), ("local_specular", self.specular_equations)):
+            if equations is not None:
+                logs = equations.logs - equations.logs.mean() + np.log(state.roughness)
+                found[name] = replace(equations, logs=logs, specular=(state.specular, equations.specular[1]))
+        return replace(solution, gloss_record={"chosen": self.roughness}, **found)
+
+
+def segments_at(mesh: Mesh, face_segment: np.ndarray | None, positions: np.ndarray) -> np.ndarray | None:
+    """Segment [P] of the nearest vertices; None where the mesh has no segments."""
+    if face_segment is None:
+        return None
+    of_vertex = np.zeros(len(mesh.vertices), int)
+    of_vertex[mesh.faces] = face_segment[:, None]
+    return of_vertex[cKDTree(mesh.vertices).query(positions)[1]]
+
+
+class GlossLadder:
+    """Climbs the variation of gloss under a solution that has highlights.
+
+    segment [P] of the capture's points, or None; rungs: of "specular" and "roughness"; report: receives the records.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        settings: Settings,
+        trial: Trial,
+        segment: np.ndarray | None,
+        rungs: Mapping[str, tuple[str, ...]],
+        report: Callable[[dict], None],
+    ):
+        self.solver = solver = AppearanceSolver(capture, settings)
+        solver.take_state(trial.solution.state)
+        solver.bake()
+        solver.bake_lobes()
+        self.irradiance, self.reflection = solver.forward(solver.state.light)
+        model = solver.model(self.irradiance, self.reflection)
+        self.weight = solver.weights(model)
+        solver.measure_misfit(model, self.weight)
+        local = gloss_equations(solver, self.irradiance, self.weight * solver.fitted)
+        self.pools: dict[str, GlossEquations | None] = {"one_value": None, "local": local}
+        if segment is not None:
+            by_segment = SegmentGloss(**vars(local), segment=segment)
+            self.pools["by_segment"] = by_segment.centred()
+        self.trial, self.rungs, self.report = trial, rungs, report
+
+    def climb(self) -> Gloss:
+        """The variation that no rung beyond serves better."""
+        chosen = {"specular": "one_value", "roughness": "one_value"}
+        present = self._try(chosen)
+        for part in chosen:
+            missed = 0
+            for rung in [name for name in self.rungs[part][1:] if name in self.pools]:
+                trial = self._try(chosen | {part: rung})
+                better = serves(present.errors, trial.errors)
+                self.report(describe(part, rung, trial, present, better))
+                if better:
+                    chosen, present, missed = chosen | {part: rung}, trial, 0
+                else:
+                    missed += 1
+                if missed == LOOK_AHEAD:
+                    break
+        return Gloss(**chosen, **{f"{part}_equations": self.pools[name] for part, name in chosen.items()})
+
+    def _try(self, chosen: Mapping[str, str]) -> Trial:
+        begun, solver = time.perf_counter(), self.solver
+        specular, roughness = (self.pools[chosen[part]] for part in ("specular", "roughness"))
+        positions, reflection = solver.capture.points.positions, self.reflection
+        if roughness is not None:
+            solver.bake_lobes(np.maximum(roughness.roughness(positions), solver.table.narrowest))
+            reflection = solver.forward(solver.state.light)[1]
+        intensity = solver.state.specular if specular is None else specular.specular_at(positions)
+        intensity = np.broadcast_to(intensity, len(positions)).astype(np.float32)
+        shown = reflection * torch.from_numpy(intensity)[None, :, None]
+        albedo = solver.eliminate(self.irradiance, shown, self.weight, 1.0)
+        errors = solver.frame_errors(albedo * self.irradiance + shown)[~solver.capture.fitted]
+        return replace(self.trial, errors=errors, seconds=time.perf_counter() - begun)
