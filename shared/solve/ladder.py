@@ -10,9 +10,9 @@ Each part of the model has rungs of its own, from the least to the most:
 
 The climb starts at the bottom of all and tries the next rung of one part after the other, each from the solution
 below it, until no part climbs any more. A rung is climbed if the mean absolute error on held-out frames, paired frame
-by frame, falls by more than its standard error, and by more than a step of the solver that is worth while. Rungs are
-not all nested (a sun in the sky is no special case of harmonics), so that the one beyond a rung that did not serve is
-tried, too.
+by frame, falls by more than its standard error; where a rung brings unknowns, also by more than a step of the solver
+that is worth while. Rungs are not all nested (a sun in the sky is no special case of harmonics), so that the one beyond
+a rung that did not serve is tried, too.
 
 References: Breiman et al., Classification and regression trees, 1984, 3.4.3 (the one-standard-error rule).
 """
@@ -41,7 +41,7 @@ LIGHTS = {
 VISIBILITIES = ("off", "on", "bounces")
 SPECULARS = ("none", "one_value")
 WORTHWHILE = 0.005
-"""Share of the error that a rung must save besides: as much as the solver leaves when it stops."""
+"""Share of the error that a rung with more unknowns must save besides: as much as the solver leaves when it stops."""
 PARTS = ("visibility", "specular", "light", "geometry", "roughness")
 """What can be forced."""
 FEWEST_HELD_OUT = 3
@@ -74,6 +74,8 @@ def allowed_rungs(settings: Settings, forced: frozenset[str] = frozenset()) -> d
     """The rungs of each part up to what the settings say; of forced parts only that."""
     finest = max(settings.resolutions)
     lights = tuple(name for name, (model, resolution) in LIGHTS.items() if model != "cubemap" or resolution <= finest)
+    if ("cubemap", finest) not in LIGHTS.values():
+        lights += ("cubemap",)  # of the one resolution that the settings name
     visibility = 1 + settings.visibility + (settings.visibility and settings.bounce)
     rungs = {
         "visibility": VISIBILITIES[:visibility],
@@ -99,10 +101,10 @@ def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
     return float(falls.mean()), float(falls.std(ddof=1) / np.sqrt(len(falls)))
 
 
-def serves(before: np.ndarray, after: np.ndarray) -> bool:
-    """Whether errors [H] fell by more than chance."""
+def serves(before: np.ndarray, after: np.ndarray, worthwhile: float = WORTHWHILE) -> bool:
+    """Whether errors [H] fell by more than chance, and by more than a share of them."""
     fall, standard_error = gain(before, after)
-    return fall > max(standard_error, WORTHWHILE * float(before.mean()))
+    return fall > max(standard_error, worthwhile * float(before.mean()))
 
 
 class Ladder:
@@ -155,7 +157,9 @@ class Ladder:
             if part == "visibility" and self._at_bottom():
                 # What fits without shadows can be a long way from what fits with them.
                 trial = min(trial, self._try(model, None), key=lambda trial: trial.errors.mean())
-            better = serves(self.present.errors, trial.errors)
+            # Shadows and bounces bring no unknowns that could follow the noise, and cost next to nothing.
+            worthwhile = 0.0 if part == "visibility" else WORTHWHILE
+            better = serves(self.present.errors, trial.errors, worthwhile)
             self.report(describe(part, names[place], trial, self.present, better))
             if better:
                 self.present, climbed, missed = trial, True, 0
