@@ -14,7 +14,8 @@ from tools.tradeoff_cases import ChartCase
 from tools.tradeoff_runs import SHOWN, Solved, current_code
 
 SCHEMA = 1
-EXPORT = "export_usd"
+ORDER = ("sample_frames", "track_landmarks", "init_albedo", "inverse_render", "export_usd")
+EXPORT = ORDER[-1]
 COSTS = {
     "seconds": "seconds from the clip to the maps",
     "cpu_seconds": "processor seconds from the clip to the maps",
@@ -108,9 +109,14 @@ def row_costs(row: Mapping) -> dict[str, float]:
 def csv_row(row: Mapping) -> dict[str, object]:
     """One flat line: what was run, its costs, each stage's seconds, every score."""
     names = ("case", "group", "repeat", "threads")
-    stages = {f"{name}_s": cost["wall_s"] for name, cost in row["stages"].items() if not name.startswith("Mitsuba")}
+    stages = {f"{name}_s": row["stages"][name]["wall_s"] for name in in_order(row["stages"]) if name in ORDER}
     settings = {"settings": " ".join(row["settings"])}
     return {name: row[name] for name in names} | row_costs(row) | stages | row["scores"] | settings
+
+
+def in_order(stages: Iterable[str]) -> list[str]:
+    """The pipeline's stages as they follow each other, then others."""
+    return sorted(stages, key=lambda name: (ORDER.index(name) if name in ORDER else len(ORDER), name))
 
 
 def summarise(rows: Iterable[Mapping]) -> list[dict]:
@@ -125,7 +131,7 @@ def summarise(rows: Iterable[Mapping]) -> list[dict]:
         point |= {key: _median(costs, key) for key in costs[0]}
         spans = {key: [cost[key] for cost in costs if key in cost] for key in costs[0]}
         point["ranges"] = {key: [min(values), max(values)] for key, values in spans.items()}
-        walls = [{stage: cost["wall_s"] for stage, cost in row["stages"].items()} for row in own]
+        walls = [{stage: row["stages"][stage]["wall_s"] for stage in in_order(row["stages"])} for row in own]
         point["stages"] = {stage: _median(walls, stage) for stage in walls[0]}
         point["scores"] = {key: _median([row["scores"] for row in own], key) for key in own[0]["scores"]}
         points.append(point)

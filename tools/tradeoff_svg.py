@@ -17,7 +17,8 @@ CHARACTER, LINE = 5.9, 13.0
 """Width and height of a label's text in the drawing's units, roughly."""
 SPREAD = 3.0
 _STYLE = (
-    "text{font:11px sans-serif;fill:#444}.preset{font-weight:bold;font-size:13px;fill:#111}.grid{stroke:#e4e4e4}"
+    "text{font:11px sans-serif;fill:#444;paint-order:stroke;stroke:#fff;stroke-width:3px}"
+    ".preset{font-weight:bold;font-size:13px;fill:#111}.grid{stroke:#e4e4e4}"
     ".front{stroke:#111;fill:none;stroke-dasharray:5 3}.range{stroke-width:1.4;opacity:.6}.lead{stroke:#bbb}"
 )
 
