@@ -67,6 +67,7 @@ def test_a_larger_clip_has_more_cases():
 def test_words_choose_cases():
     cases = all_cases(load_pipeline(), "draft", "quick", CLIP)
     assert [case.name for case in chosen_cases(cases, ["matte", "standard"])] == ["draft, matte", "standard"]
+    assert [case.name for case in chosen_cases(cases, ["draft"])] == ["draft"]
     with pytest.raises(InputError, match="no such case.*sparkle"):
         chosen_cases(cases, ["sparkle"])
 

@@ -146,7 +146,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("subject", type=Path, nargs="?", default=DEMO)
     found.add_argument("--cases", choices=SETS, default="quick")
     found.add_argument("--base", help="the preset that ablations change (quick: draft, all: standard)")
-    found.add_argument("--only", nargs="*", metavar="WORD", help="cases whose name holds one of the words")
+    found.add_argument("--only", nargs="*", metavar="WORD", help="cases of these names, or whose name holds a word")
     found.add_argument("--repeats", type=int, default=2)
     found.add_argument("--minutes", type=float, help="no case begins later")
     found.add_argument("--work", type=Path, default=REPOSITORY / "build" / "chart_work", help="for unfinished runs")

@@ -87,10 +87,10 @@ def all_cases(pipeline: Pipeline, base: str, which: str, clip: Mapping[str, floa
 
 
 def chosen_cases(cases: Sequence[ChartCase], words: Iterable[str]) -> list[ChartCase]:
-    """Those whose name holds one of the words; InputError where a word fits none."""
+    """Those that a word names, or else those whose name holds it; InputError where a word fits none."""
     found = []
     for word in words:
-        fitting = [case for case in cases if word in case.name]
+        fitting = [case for case in cases if case.name == word] or [case for case in cases if word in case.name]
         if not fitting:
             raise InputError("no such case", where="--only", got=word, expected=", ".join(case.name for case in cases))
         found += [case for case in fitting if case not in found]
