@@ -83,9 +83,8 @@ class Chart:
         self.peer_python = options.peer_python or sys.executable
         self.has_peer = bool(options.peer_python) or importlib.util.find_spec("mitsuba") is not None
         clip = read_json(self.subject.folder / "capture.json")
-        self.cases = all_cases(self.pipeline, self.base, options.cases, clip)
-        if options.only:
-            self.cases = chosen_cases(self.cases, options.only)
+        self.all = all_cases(self.pipeline, self.base, options.cases, clip)
+        self.cases = chosen_cases(self.all, options.only) if options.only else self.all
         self.failed: list[str] = []
 
     def measure(self, repeats: int, minutes: float | None) -> None:
@@ -103,7 +102,8 @@ class Chart:
                         print("the minutes are over; call again to go on")
                         return
                     self._measure_case(runs, case, repeat)
-            shutil.rmtree(runs.work, ignore_errors=True)
+            if all(self.rows.has(case, repeat, self.threads) for case in self.all):
+                shutil.rmtree(runs.work, ignore_errors=True)
 
     def _measure_case(self, runs: Runs, case: ChartCase, repeat: int) -> None:
         try:
