@@ -14,7 +14,7 @@ from shared.contract.pipeline import load_pipeline
 from shared.contract.subject import load_subject
 from shared.errors import InputError
 from shared.io.arrays import load_arrays, read_json, save_arrays, write_json
-from tools import tradeoff_runs
+from tools import chart, tradeoff_runs
 from tools.goldens import TINY_SUBJECT
 from tools.score import camera_intrinsics, score
 from tools.tradeoff_cases import ABLATIONS, GROUPS, PEER, PRESET, QUICK, ChartCase, all_cases, chosen_cases
@@ -246,3 +246,59 @@ def test_a_solved_stage_is_scored_with_pictures(tiny_run):
     assert scores[ERROR] == pytest.approx(exported[ERROR], abs=0.02)
     assert scores["geometry_mm.median"] == exported["geometry_mm.median"]
     assert scores["rerender.psnr"] == pytest.approx(exported["rerender.psnr"], abs=0.5)
+
+
+# ---------------------------------------------------------------- the command
+@pytest.fixture
+def command(tmp_path, monkeypatch):
+    """chart.main on the tiny subject with a stand-in for the stages; calls: (repeat, case) in order."""
+    calls = []
+
+    class StandIn(Runs):
+        def solve(self, case):
+            calls.append((self.work.name, case.name))
+            if case.name == "draft, matte" and "fail" in calls[0]:
+                raise InputError("failed", got="a stage")
+            return [solved(10.0 + len(calls), f"digest of {case.name}")]
+
+    monkeypatch.setattr(chart, "Runs", StandIn)
+    monkeypatch.setattr(chart, "scores_of", lambda subject, folder: {ERROR: 1.0 + 0.1 * len(calls)})
+    folders = ["--out", str(tmp_path / "out"), "--work", str(tmp_path / "work")]
+    chosen = ["--only", "draft", "standard", "matte"]
+    return lambda *more: chart.main([str(TINY_SUBJECT), *folders, *chosen, *more]), calls, tmp_path / "out"
+
+
+def test_all_cases_are_measured_before_any_is_again(command):
+    run, calls, out = command
+    assert run("--repeats", "2") == 0
+    names = ["draft", "standard", "draft, matte"]
+    assert calls == [("repeat0", name) for name in names] + [("repeat1", name) for name in names]
+    rows = read_json(out / "chart.json")["rows"]
+    assert len(rows) == 6 and rows[0]["scores"] == rows[3]["scores"] != rows[1]["scores"]
+    assert "draft" in (out / "chart.svg").read_text() and "standard" in (out / "chart.html").read_text()
+    assert run("--repeats", "3") == 0
+    assert calls[6:] == [("repeat2", name) for name in names]
+
+
+def test_a_case_that_fails_does_not_stop_the_others(command, capsys):
+    run, calls, out = command
+    calls.append("fail")
+    assert run("--repeats", "1") == 1
+    assert [row["case"] for row in read_json(out / "chart.json")["rows"]] == ["draft", "standard"]
+    assert "failed: draft, matte" in capsys.readouterr().err
+    calls.clear()
+    calls.append("from now on it works")
+    assert run("--repeats", "1") == 0 and calls[1:] == [("repeat0", "draft, matte")]
+
+
+def test_no_case_begins_when_the_minutes_are_over(command):
+    run, calls, _ = command
+    assert run("--minutes", "0") == 0 and calls == []
+
+
+def test_it_lists_what_is_there_and_wants_a_truth(command, tmp_path, capsys):
+    run, calls, _ = command
+    assert run("--list") == 0 and calls == []
+    assert "draft, matte: 0 of 2; draft inverse_render.specular=false" in capsys.readouterr().out
+    assert chart.main([str(make_subject(tmp_path / "poem"))]) == 2
+    assert "no ground truth" in capsys.readouterr().err
