@@ -20,7 +20,7 @@ from shared.errors import InputError, LimnError
 
 STAGE = Stage(
     name="sample_frames",
-    version=2,
+    version=3,
     help="Decode the clip, choose good frames evenly in time, crop them to the head and mask the person.",
     inputs=(),
     outputs=(
@@ -116,13 +116,15 @@ def write_frames(reader, selection, networks, chart, job: Job) -> tuple[list[dic
     """The second pass: crops, masks and the contact sheet -> one record per frame, and warnings."""
     from shared.contact_sheet import ContactSheet
     from shared.crop_pixels import area_average, clipped_share, display_codes, frame_mask, is_grey
+    from shared.framing import face_height
     from shared.io.images import write_png
+    from shared.picture_detail import ClipDetail
     from shared.read_ahead import read_ahead
 
     for folder in ("frames", "masks"):
         (job.out / folder).mkdir(parents=True, exist_ok=True)
     crop, transfer, count = selection.crop, job.subject.transfer, len(selection.frame_index)
-    sheet, records, clipped, grey = ContactSheet(count), [], [], []
+    sheet, records, clipped, grey, detail = ContactSheet(count), [], [], [], ClipDetail(count)
     chart.expect(count)
 
     def cut_out(frame):
@@ -141,6 +143,7 @@ def write_frames(reader, selection, networks, chart, job: Job) -> tuple[list[dic
         write_png(job.out / records[-1]["mask"], mask)
         clipped.append(clipped_share(codes, mask))
         grey.append(is_grey(codes))
+        detail.look(i, rgb, mask == FACE, face_height(points))
         sheet.add(rgb, mask)
     write_png(job.out / "contact_sheet.png", sheet.picture())
     if chart.picture is not None:
@@ -150,7 +153,7 @@ def write_frames(reader, selection, networks, chart, job: Job) -> tuple[list[dic
         warnings.append(f"{np.mean(clipped):.0%} of the face is overexposed: expose it darker")
     if np.mean(grey) > 0.5:
         warnings.append("the clip has no colour: the maps will be grey")
-    return records, warnings
+    return records, [*warnings, *detail.warnings()]
 
 
 def frame_record(frame_index: int, time_s: float, points: np.ndarray, sharpness: float) -> dict:

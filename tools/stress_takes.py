@@ -72,9 +72,10 @@ class Take:
 
     @property
     def settings(self) -> Settings:
-        """Of the synthesiser."""
+        """Of the synthesiser; sharp highlights need more samples."""
+        quality = SETTINGS.picture if not self.wet else replace(SETTINGS.picture, lobe_samples=4, lamp_samples=8)
         return replace(SETTINGS, frames=self.frames, yaw_deg=self.yaw_deg, pitch_deg=self.pitch_deg, tone=self.tone,
-                       lights=(self.light,), seed=self.seed)
+                       lights=(self.light,), seed=self.seed, picture=quality)
 
 
 @cache

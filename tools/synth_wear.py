@@ -32,7 +32,7 @@ RIM_MM = (26.0, 20.0)
 """Half width and half height of a rim."""
 WRAP, CLEARANCE_MM, FRONT_MM = 0.12, 1.0, 400.0
 """How fast rims recede sideways; what stays free between them and the skin; where rays start."""
-EAR_MM = (14.0, -12.0)
+EAR_MM, BEFORE_EARS_MM = (14.0, -12.0), 22.0
 STRAND_MM, STRAND_GAP_MM = (1.6, 0.5), 4.0
 BEARD_SEGMENTS = ("chin", "jaw", "upper_lip_skin")
 BEARD_WAVELENGTH_MM = 5.0
@@ -86,7 +86,7 @@ def with_glasses(head: Head, radius_mm: float) -> Head:
 def _temple(head: Head, hinge: np.ndarray, radius_mm: float) -> Tube:
     """From the rim's outer end [3] around the side of the head to the ear."""
     y, z = head.mesh.vertices[:, 1], head.mesh.vertices[:, 2]
-    beside = (np.abs(y - 0.5 * (hinge[1] + EAR_MM[0])) < 15.0) & (z > EAR_MM[1] + 12.0) & (z < hinge[2])
+    beside = (np.abs(y - 0.5 * (hinge[1] + EAR_MM[0])) < 15.0) & (z > BEFORE_EARS_MM) & (z < hinge[2])
     across = np.sign(hinge[0]) * (np.abs(head.mesh.vertices[beside, 0]).max() + radius_mm + CLEARANCE_MM)
     bend, ear = np.array([across, hinge[1], hinge[2] - 14.0]), np.array([across, *EAR_MM])
     line = np.concatenate([np.linspace(hinge, bend, 5), np.linspace(bend, ear, 16)[1:]])

@@ -24,6 +24,13 @@ _ADVICE = (
     (r"beyond the picture's edge", "Film again with room around the head: what leaves the picture has no texture."),
     (r"brightness wanders|flicker",
      "Lock the exposure and keep the light still; maps from this clip average over its changes."),
+    (r"colour wanders", "Lock the white balance; maps from this clip average over its changes."),
+    (r"follows the surface's orientation",
+     "Film with lights that stand still, none on the head or in the hand, and a wider turn; a lamp that moves along "
+     "ends up in the albedo as if it were skin."),
+    (r"unlikely colour",
+     "Check colour: transfer in subject.yaml, switch filters off, or show a colour chart; the albedo's tint is a "
+     "guess."),
     (r"held out fit worse",
      "Look at Motion and at the error maps for frames that stand out; film with a still light, or leave such frames "
      "out by a higher sample_frames.blurred_below."),
@@ -38,7 +45,8 @@ _ADVICE = (
     (r"alpha", "Nothing to do if the pictures are meant to be opaque."),
     (r"numbers are missing", "Give all frames of the shot: gaps count as dropped frames."),
     (r"clipp|overexpos|saturat", "Film darker by a stop or two: clipped skin tells only that it is bright."),
-    (r"underexpos|too dark|crushed", "Film brighter, or add light; noise in the dark parts ends up in the maps."),
+    (r"underexpos|too dark|crushed|noise is",
+     "Film brighter, or add light; noise in the dark parts ends up in the maps."),
     (r"behind|not determined|no highlight|confidence",
      "Nothing in the clip shows this. Film a wider turn, or treat maps and light there as a guess."),
     (r"around the mouth|expression|smil|blink",

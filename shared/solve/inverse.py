@@ -26,6 +26,7 @@ from shared.solve.capture import (
     spread_frames,
 )
 from shared.solve.chart_scale import describe_scale, doubt_scale, state_chart
+from shared.solve.doubts import doubts_about, signs_of
 from shared.solve.fit_appearance import Solution, fit_appearance, with_local_roughness
 from shared.solve.frame_choice import covering_frames
 from shared.solve.light_models import SeveralLights
@@ -136,6 +137,7 @@ def solve_clip(
     chart, warning = state_chart(sights, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves, light)
     lit = solve_light(inputs, settings, viewer, fitted, chart, progress, note)
     inputs, settings, viewer = lit.inputs, lit.settings, lit.viewer
+    signs = signs_of(lit.capture, settings.appearance, lit.solution)
     solution = with_local_roughness(lit.capture, settings.appearance, lit.solution)
     shading = shade_vertices(inputs, settings.appearance, viewer, lit.scenery, solution, progress)
     surface = TexelSurface(inputs.mesh, settings.map_size)
@@ -147,8 +149,8 @@ def solve_clip(
     gloss = solution.gloss
     roughness = solution.state.roughness if gloss is None else gloss.roughness(inputs.mesh.vertices)
     maps = make_maps(surface, material, roughness)
-    warnings = [*[warning] * bool(warning), *doubt_scale(chart, typical)]
-    record = {"texture": texture_record, "shape": lit.shape_record, "warnings": warnings}
+    warnings = [*[warning] * bool(warning), *doubt_scale(chart, typical), *doubts_about(signs)]
+    record = {"texture": texture_record, "shape": lit.shape_record, "signs": signs, "warnings": warnings}
     record |= {"albedo_scale": describe_scale(chart, typical), "rungs": lit.rungs}
     return InverseResult(solution, material, maps, shading, viewer, fitted, record)
 
@@ -338,7 +340,7 @@ def summarise(inputs: InverseInputs, result: InverseResult) -> dict:
             "held_out": solution.held_out,
             "texture_held_out": result.record["texture"]["held_out"],
         },
-        **{key: result.record[key] for key in ("shape",) if key in result.record},
+        **{key: result.record[key] for key in ("shape", "signs") if key in result.record},
         **({"ladder": [dict(rung) for rung in result.record["rungs"]]} if result.record.get("rungs") else {}),
         "iterations": list(solution.iterations),
         "albedo_scale": result.record["albedo_scale"],

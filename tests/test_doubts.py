@@ -1,0 +1,71 @@
+"""Signs of causes that the model cannot follow, on the egg whose light and albedo are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toy_capture import FRAMES, make_truth
+
+from shared.solve.appearance import Settings
+from shared.solve.doubts import by_orientation, doubts_about, signs_of, unlikely_colour
+from shared.solve.fit_appearance import fit_appearance
+
+MATTE = Settings(resolutions=(6,), steps=5, specular=False, noise=(0.003, 0.01))
+
+
+@pytest.fixture(scope="module")
+def capture(one_thread):
+    return make_truth(specular=0.0)[0]
+
+
+def signs(capture, colours=None):
+    if colours is not None:
+        capture = replace(capture, samples=replace(capture.samples, colours=colours.astype(np.float32)))
+    return signs_of(capture, MATTE, fit_appearance(capture, MATTE))
+
+
+@pytest.fixture(scope="module")
+def calm(capture):
+    return signs(capture)
+
+
+def test_a_good_clip_shows_none(calm):
+    assert calm["frame_gain"] < 0.012 and calm["frame_tint"] < 0.012 and calm["unlikely_colour"] < 2.0
+    assert doubts_about(calm) == []
+
+
+def test_wandering_exposure_and_white_balance_are_told_apart(capture, calm):
+    # Half of it can pass for light: no two of the few frames look the same way.
+    wave = 0.1 * np.where(np.arange(FRAMES) % 2, 1.0, -1.0)
+    brighter = signs(capture, capture.samples.colours * np.exp(wave)[None, :, None])
+    assert 0.045 < brighter["frame_gain"] < 0.12 and brighter["frame_tint"] < 0.02
+    redder = signs(capture, capture.samples.colours * np.exp(wave[:, None] * [0.5, 0.0, -0.5]))
+    assert 0.045 < redder["frame_tint"] < 0.12 and redder["frame_gain"] < 0.02
+    assert "brightness wanders" in doubts_about(brighter)[0] and len(doubts_about(brighter)) == 1
+    assert "colour wanders" in doubts_about(redder)[0] and len(doubts_about(redder)) == 1
+
+
+def test_light_that_turns_along_is_seen_in_the_albedo(capture, calm):
+    """A lamp before the forehead, much stronger than the room, shades each point alike in all frames."""
+    lit = np.clip(capture.points.normals @ [0.0, 0.64, 0.77], 0.0, None)
+    colours = 0.1 * capture.samples.colours + 0.9 * lit[:, None, None] * capture.samples.colours.mean(1, keepdims=True)
+    found = signs(capture, colours)
+    assert found["albedo_by_orientation"] > calm["albedo_by_orientation"] + 0.2
+
+
+def test_only_what_follows_the_normals_counts():
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(2000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    pattern = np.exp(0.5 * rng.normal(size=2000))[:, None] * [0.3, 0.2, 0.15]
+    assert by_orientation(pattern, normals) < 0.05
+    shaded = pattern * np.exp(0.4 * normals[:, 2:])
+    assert by_orientation(shaded, normals) == pytest.approx(0.4 / np.sqrt(3), rel=0.15)
+
+
+def test_an_unlikely_colour_is_one_that_neither_skin_nor_light_has():
+    skin = np.array([0.45, 0.28, 0.21])
+    assert unlikely_colour(0.7 * skin, 0.15) < 1.0
+    assert unlikely_colour(0.01 * skin, 0.15) < 1.5  # dim light is as likely as any
+    assert unlikely_colour(skin * [0.3, 1.0, 2.0], 0.15) > 3.0
+    assert unlikely_colour(skin * [0.3, 1.0, 2.0], 0.6) < unlikely_colour(skin * [0.3, 1.0, 2.0], 0.15)
