@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from shared.geometry import WORLD_FROM_CAMERA, project, rigid, rotation_from_vector
-from shared.mesh import Mesh, interpolate, normalised, vertex_normals
-from shared.raycast import RayScene, camera_hits
+from shared.geometry import project
+from shared.mesh import Mesh, vertex_normals
+from shared.raycast import RayScene
 from shared.tracks import visible_vertices
 
 MESH_COLOUR, LANDMARK_COLOUR = (70, 220, 255), (255, 150, 40)
@@ -54,25 +54,3 @@ def _fixed(point: np.ndarray) -> tuple[int, int]:
     """Pixels with centres at + 0.5 as OpenCV's fixed point with four fractional bits."""
     x, y = np.clip((np.asarray(point) - 0.5) * 16.0, -1e6, 1e6)
     return int(round(x)), int(round(y))
-
-
-def shaded_views(mesh: Mesh, size: int = 480) -> np.ndarray:
-    """The mesh under one lamp from the front, three-quarter and side: [size, 3 size, 3] uint8."""
-    return np.concatenate([_shaded(mesh, np.radians(angle), size) for angle in (0.0, 45.0, 90.0)], axis=1)
-
-
-def _shaded(mesh: Mesh, yaw: float, size: int) -> np.ndarray:
-    centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    turn = WORLD_FROM_CAMERA @ rotation_from_vector(np.array([0.0, yaw, 0.0]))
-    extent = np.ptp(mesh.vertices, axis=0).max()
-    pose = rigid(turn, -turn @ centre + [0.0, 0.0, 6.0 * extent])
-    focal = 0.9 * size * 6.0
-    lens = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
-    face, bary, _ = camera_hits(RayScene(mesh.vertices, mesh.faces), pose, lens, size, size)
-    hit = face >= 0
-    normals = interpolate(vertex_normals(mesh.vertices, mesh.faces), mesh.faces, face[hit], bary[hit].astype(float))
-    lamp_in_world = normalised(np.array([-0.5, 0.6, 0.8]))
-    shade = np.clip(normalised(normals) @ (lamp_in_world @ WORLD_FROM_CAMERA @ turn), 0.0, 1.0)
-    picture = np.full((size, size, 3), 40, np.uint8)
-    picture[hit] = (30 + 210 * shade[:, None]).astype(np.uint8)
-    return picture

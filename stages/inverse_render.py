@@ -2,8 +2,9 @@
 
 Reads    sample_frames (frames, masks), track_landmarks (poses, mesh, segments, track points), and of several clips
          init_albedo (mean textures).
-Writes   maps/*.exr, envmap.exr, mesh.npz, poses.npz, renders/*.exr, solve.json.
-Method   In head space a surface point's view of the sphere never changes, so visibility and bounces are traced once
+Writes   maps/*.exr, envmap.exr, mesh.npz, shape.png, poses.npz, renders/*.exr, solve.json.
+Method   What no track reaches (ears, skull, jaw) moves until the mesh's outline meets the border of the person masks.
+         In head space a surface point's view of the sphere never changes, so visibility and bounces are traced once
          and reused by all frames. Light by Gauss-Newton with the albedo eliminated, specular intensity in closed form,
          roughness by line search, stopping on held-out frames. Under that light the mesh is refined from parallax and
          shading by Gauss-Newton, coarse to fine, the light solved anew, and the refined mesh kept if held-out frames
@@ -32,7 +33,7 @@ LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 STAGE = Stage(
     name="inverse_render",
-    version=6,
+    version=7,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -41,6 +42,7 @@ STAGE = Stage(
                colour_space="in each file"),
         Output("envmap.exr", "incident radiance, lat-long", space="world", colour_space="lin_rec709_scene"),
         Output("mesh.npz", "the refined mesh, with its face segments", unit="mm", space="head"),
+        Output("shape.png", "tracked and refined mesh, normals and difference, from three sides", colour_space="srgb"),
         Output("poses.npz", "camera_from_head [F, 4, 4], frame_index [F], intrinsics of source and crop", unit="mm"),
         Output("renders/*.exr", "re-renders of chosen crops, 0 outside the head", space="crop",
                colour_space="lin_rec709_scene"),
@@ -83,6 +85,8 @@ STAGE = Stage(
         Parameter("evidence", float, 5000.0, "How many independent samples the clip counts as.", "", 10.0, 1e7),
         Parameter("chart", bool, True, "Take the light's scale from the colour chart that sample_frames found."),
         Parameter("shape", bool, True, "Refine the mesh from shading, parallax and tracks."),
+        Parameter("silhouette", bool, True, "Before the solve, move ears, skull and jaw so that the outline meets the "
+                  "person mask's border."),
         Parameter("shape_subdivisions", int, 1, "Times that the mesh is subdivided for that.", "", 0, 2),
         Parameter("shape_rounds", int, 2, "Most steps of the shape per level.", "", 1, 20),
         Parameter("shape_frames", int, 48, "Frames that the shape is solved from, spread evenly.", "frames", 3, 1000),
@@ -159,12 +163,14 @@ def read_settings(job: Job, checkpoint=None):
         local_roughness=params.local_roughness,
         specular_prior=(params.specular_prior, SPECULAR_SPREAD),
     )
+    rim = {} if params.silhouette else {"rim": None}
     shape = ShapeSettings(
         subdivisions=params.shape_subdivisions,
         rounds=params.shape_rounds,
         frames=params.shape_frames,
         smoothness=params.shape_smoothness,
         sigma_mm=params.shape_spread,
+        **rim,
     )
     return InverseSettings(
         sizes=Sizes(params.points, params.directions, params.bounce_nodes),
@@ -274,16 +280,28 @@ def read_clips(job: Job) -> tuple:
     return tuple(read_inputs(*pair, params.mesh, params.poses) for pair in folders)
 
 
+def write_shape(job: Job, inputs, mesh) -> None:
+    """mesh.npz with its face segments, and shape.png."""
+    from shared.io.images import write_png
+    from shared.io.meshes import save_mesh
+    from shared.shape_pictures import shape_sheet
+    from shared.solve.inverse import FACE_SKIN
+    from shared.solve.reshape import Reshaped, faces_of, segments_of, subdivided_to
+
+    segment = segments_of(inputs, mesh)
+    save_mesh(job.out / "mesh.npz", mesh, **({} if segment is None else {"face_segment": segment}))
+    face = None if segment is None else faces_of(Reshaped(inputs, mesh), FACE_SKIN)
+    write_png(job.out / "shape.png", shape_sheet(subdivided_to(inputs.mesh, mesh), mesh, face))
+
+
 def run(job: Job) -> None:
     """Solve the light, then the texels; write and re-render."""
     import numpy as np
 
     from shared.io.arrays import write_json
     from shared.io.clip_inputs import read_mean_texture
-    from shared.io.meshes import save_mesh
     from shared.solve.inverse import solve_clip, summarise
     from shared.solve.joint_clips import join_clips
-    from shared.solve.reshape import segments_of
 
     clips = read_clips(job)
     inputs, placed = clips[0], []
@@ -302,9 +320,7 @@ def run(job: Job) -> None:
     for text in record["warnings"]:
         job.warn(text)
     write_maps(job, result)
-    segment = segments_of(inputs, result.viewer.mesh)
-    extra = {} if segment is None else {"face_segment": segment}
-    save_mesh(job.out / "mesh.npz", result.viewer.mesh, **extra)
+    write_shape(job, inputs, result.viewer.mesh)
     lights, own = np.split(result.solution.state.light, len(clips)), []
     for k, clip in enumerate(clips):
         folder, rows = job.out / "clips" / job.clips[k] if k else job.out, np.nonzero(inputs.light_index == k)[0]

@@ -19,7 +19,7 @@ from shared.solve.shape import Reflectance, ShapeClip, ShapeSettings, ShapeSolve
 from shared.solve.shape_equations import EquationSettings
 from shared.solve.shape_samples import projection_slope, tangent_frames
 from shared.solve.shape_step import TrackPoints, large_step_metric, normal_turns
-from shared.solve.shape_terms import shading_terms
+from shared.solve.shape_terms import Reflections, shading_terms
 from shared.transfer import mesh_points
 
 FRAMES, SIZE, ROUGHNESS, SPECULAR = 20, 240, 0.4, 0.7
@@ -143,7 +143,7 @@ def test_irradiance_turns_with_the_normal(toy):
     mesh = toy.truth
     shading, _, _ = shade(mesh, poses, toy.reflectance.light)
     rows = np.nonzero((mesh.vertices[:, 2] > 70.0) & (shading.transfer.blocked < 0.01))[0][::40]
-    terms = shading_terms(shading, rows, True)
+    terms = shading_terms(shading, rows, Reflections(shading, np.arange(len(shading.points))))
     turned = normalised(shading.points.normals[rows] + 0.05 * terms.tangents[:, 0])
     weight = np.maximum(turned @ shading.directions.T, 0.0) * (4.0 / len(shading.directions))
     direct = np.einsum("pj,jfc->pfc", weight * shading.transfer.visibility(rows), shading.light_along)

@@ -249,9 +249,13 @@ class LargeClip:
         """Frame f, enlarged."""
         frames, i = self._inputs.frames, int(self._inputs.place[self._frame[f]])
         codes = cv2.resize(frames.read_codes(i), self.size, interpolation=cv2.INTER_LINEAR)
-        mask = cv2.resize(frames.read_mask(i), self.size, interpolation=cv2.INTER_NEAREST)
         steps = np.iinfo(codes.dtype).max
-        return prepare_picture(codes, decode_transfer(np.arange(steps + 1) / steps, frames.transfer)[codes], mask)
+        table = decode_transfer(np.arange(steps + 1) / steps, frames.transfer)
+        return prepare_picture(codes, table[codes], self.mask(f))
+
+    def mask(self, f: int) -> np.ndarray:
+        """Its mask, enlarged."""
+        return cv2.resize(self._inputs.mask(int(self._frame[f])), self.size, interpolation=cv2.INTER_NEAREST)
 
 
 def cost_table(inputs: ClipInputs, changes: dict) -> None:

@@ -55,7 +55,11 @@ class ClipInputs:
         codes = self.frames.read_codes(i)
         steps = np.iinfo(codes.dtype).max
         table = decode_transfer(np.arange(steps + 1) / steps, self.frames.transfer)
-        return prepare_picture(codes, table[codes], self.frames.read_mask(i))
+        return prepare_picture(codes, table[codes], self.mask(f))
+
+    def mask(self, f: int) -> np.ndarray:
+        """Frame f's mask [H, W] uint8, 0: background."""
+        return self.frames.read_mask(int(self.place[f]))
 
     def chart_sights(self) -> tuple[ChartSight, ...]:
         """The colour chart in the frames where one was found."""

@@ -66,6 +66,7 @@ def result_report(result: Result, frame_count: int) -> str:
     chosen = chosen_frames([*solve["render_frames"], *again], held_out, frame_count)
     angles, position = motion(poses["camera_from_head"], frames.moves)
     overlay, chart = tracked / "overlay.png", result.folders["sample_frames"] / "chart.png"
+    shape = solved / "shape.png"
     excluded = excluded_frames(result.folders["sample_frames"], tracked)
     content = ReportContent(
         name=result.name,
@@ -80,6 +81,7 @@ def result_report(result: Result, frame_count: int) -> str:
         angles_deg=angles,
         position_mm=position,
         overlay=read_png(overlay) if overlay.is_file() else None,
+        shape=read_png(shape) if shape.is_file() else None,
         chart=read_png(chart) if chart.is_file() else None,
         excluded=excluded,
         model={**solve.get("model", {}), "albedo_scale": solve.get("albedo_scale")},

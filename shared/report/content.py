@@ -73,6 +73,7 @@ class ReportContent:
     position_mm: np.ndarray
     views: ViewSet | None = None
     overlay: np.ndarray | None = None
+    shape: np.ndarray | None = None
     chart: np.ndarray | None = None
     excluded: Sequence[tuple[int, str, str]] = ()
     ladder: Sequence[Mapping[str, object]] = ()

@@ -37,6 +37,7 @@ def report_html(content: ReportContent) -> str:
         ("frames", "Clip and re-render", sections.comparison_section(frames)),
         ("maps", "Maps", sections.map_section(content.maps)),
         ("view", "In the round", _VIEWER),
+        ("shape", "Shape", view_sections.shape_section(content.shape)),
         ("novel", "Novel views", view_sections.novel_section(content.views)),
         ("relit", "Other lights", view_sections.relit_section(content.views)),
         ("visibility", "Visibility", view_sections.visibility_section(content.views)),

@@ -11,8 +11,19 @@ from shared.report.sections import figure
 from shared.studio_lights import STUDIO_LIGHTS
 from shared.view_set import NOVEL_VIEWS, ViewSet
 
-VIEW_PIXELS = 512
+VIEW_PIXELS, SHEET_PIXELS = 512, 1600
 _NOTHING = 90
+
+
+def shape_section(sheet: np.ndarray | None) -> str:
+    """The refined mesh beside the tracked one. sheet: as of shape_pictures.shape_sheet."""
+    if sheet is None:
+        return "<p>inverse_render left no picture of the shape.</p>"
+    caption = (
+        "From above: the tracked mesh, the refined one, its normals (red: to the right, green: up, blue: to the "
+        "camera), and how far it was moved."
+    )
+    return figure(jpeg_uri(shrunk(sheet, SHEET_PIXELS)), "the shape from three sides", caption, zoom=True)
 
 
 def novel_section(views: ViewSet | None) -> str:

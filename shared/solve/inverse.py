@@ -31,7 +31,7 @@ from shared.solve.fit_appearance import Solution, fit_appearance, with_local_rou
 from shared.solve.frame_choice import covering_frames
 from shared.solve.light_models import SeveralLights
 from shared.solve.reference_settings import ReferenceSettings
-from shared.solve.reshape import faces_of, reshape
+from shared.solve.reshape import faces_of, meet_outline, reshape
 from shared.solve.shape import Reflectance, ShapeSettings
 from shared.solve.texture import PRIOR_SPREAD, TexelMaterial
 from shared.solve.texture_pass import Clip, TexturePass
@@ -46,10 +46,10 @@ clothes may cover are left out."""
 class InverseInputs(Protocol):
     """What the solver needs of a clip or of several; shared.io.clip_inputs.ClipInputs is one.
 
-    picture(f): frame f of F ready for sampling; camera_from_head [F, 4, 4]; intrinsics [3, 3], or [F, 3, 3], and size
-    (width, height) of the pictures; moves: "head" or "camera"; face_segment [faces] or None where the mesh has no
-    segments; tracks: points [N, 3] on the skin with their errors [N], px, or None; light_index [F]: which light each
-    frame stands in, 0 first, frames of one light in a row.
+    picture(f): frame f of F ready for sampling; mask(f) [H, W], 0: background; camera_from_head [F, 4, 4]; intrinsics
+    [3, 3], or [F, 3, 3], and size (width, height) of the pictures; moves: "head" or "camera"; face_segment [faces] or
+    None where the mesh has no segments; tracks: points [N, 3] on the skin with their errors [N], px, or None;
+    light_index [F]: which light each frame stands in, 0 first, frames of one light in a row.
     """
 
     mesh: Mesh
@@ -63,6 +63,8 @@ class InverseInputs(Protocol):
     light_index: np.ndarray
 
     def picture(self, f: int) -> Picture: ...
+
+    def mask(self, f: int) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,11 @@ def solve_clip(
         from shared.solve.reference_clip import solve_by_reference
 
         return solve_by_reference(inputs, settings, settings.reference, fitted, progress, note)
+    outline = {}
+    if settings.shape is not None and settings.shape.rim is not None and inputs.face_segment is not None:
+        frames = frames_of(inputs, settings, settings.shape.rim.frames, fitted)
+        inputs, outline = meet_outline(inputs, frames, settings.shape.rim, note)
+        viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
     moves = settings.appearance.light_moves(inputs.moves)
     light = int(inputs.light_index[sights[0].frame]) if sights else 0
     chart, warning = state_chart(sights, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves, light)
@@ -150,7 +157,8 @@ def solve_clip(
     roughness = solution.state.roughness if gloss is None else gloss.roughness(inputs.mesh.vertices)
     maps = make_maps(surface, material, roughness)
     warnings = [*[warning] * bool(warning), *doubt_scale(chart, typical), *doubts_about(signs)]
-    record = {"texture": texture_record, "shape": lit.shape_record, "signs": signs, "warnings": warnings}
+    shape_record = {**lit.shape_record, "outline": outline}
+    record = {"texture": texture_record, "shape": shape_record, "signs": signs, "warnings": warnings}
     record |= {"albedo_scale": describe_scale(chart, typical), "rungs": lit.rungs}
     return InverseResult(solution, material, maps, shading, viewer, fitted, record)
 

@@ -63,6 +63,11 @@ class JointInputs:
         clip = int(self.light_index[f])
         return self.clips[clip].picture(f - self._first(clip))
 
+    def mask(self, f: int) -> np.ndarray:
+        """Its mask [H, W], 0: background."""
+        clip = int(self.light_index[f])
+        return self.clips[clip].mask(f - self._first(clip))
+
     def _first(self, clip: int) -> int:
         return int(np.searchsorted(self.light_index, clip))
 

@@ -5,15 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from shared.geometry import camera_centres
 from shared.intersections import move_without_crossing
-from shared.mesh import Mesh, normalised
+from shared.mesh import Mesh, normalised, subdivide
 from shared.solve.appearance import Settings
 from shared.solve.capture import Sizes, lens_of_frames
 from shared.solve.shape import HELD, SHAPED, Reflectance, ShapeClip, ShapeSettings, ShapeSolver
 from shared.solve.shape_step import TrackPoints
+from shared.solve.silhouette import Outlines, RimSettings, fit_outline, mask_distance
 
+OUTLINED = ("forehead", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "lips", "chin", "jaw", "ears", "scalp")
+"""Segments that may form the outline. The neck bends, and clothes cover it."""
+TRACK_REACH_MM = 6.0
+"""So far around a track point the tracks tell the surface better than an outline does."""
 TRACK_FLOOR_MM = 0.1
 """Error of a track point that more frames or sharper pictures do not lessen."""
 
@@ -35,6 +41,13 @@ def segments_of(inputs, mesh: Mesh) -> np.ndarray | None:
     return None if inputs.face_segment is None else np.repeat(inputs.face_segment, times)
 
 
+def subdivided_to(mesh: Mesh, finer: Mesh) -> Mesh:
+    """The mesh, subdivided until it has the topology of a finer one that was made from it."""
+    while len(mesh.faces) < len(finer.faces):
+        mesh = subdivide(mesh)
+    return mesh
+
+
 def faces_of(inputs, names: tuple[str, ...]) -> np.ndarray:
     """[faces] bool: faces in the named segments."""
     wanted = [inputs.segment_names.index(name) for name in names if name in inputs.segment_names]
@@ -51,6 +64,26 @@ def track_points(
     depth = residual_px / px_per_mm / max(np.sin(half_angle), 0.01)
     known = np.isfinite(depth)
     return TrackPoints(positions[known], np.hypot(TRACK_FLOOR_MM, depth[known]))
+
+
+def meet_outline(inputs, frames: tuple[np.ndarray, np.ndarray], settings: RimSettings, note: Callable):
+    """The inputs with their mesh moved to meet the person masks' borders where no track lies, and a record; frames:
+    which, and which of them are fitted."""
+    chosen, fitted = frames
+    outlines = Outlines(
+        tuple(mask_distance(inputs.mask(int(f))) for f in chosen),
+        inputs.camera_from_head[chosen],
+        fitted,
+        np.broadcast_to(lens_of_frames(inputs.intrinsics, chosen), (len(chosen), 3, 3)),
+    )
+    vertices = inputs.mesh.vertices
+    if inputs.tracks is None:
+        known = np.isin(np.arange(len(vertices)), inputs.mesh.faces[faces_of(inputs, SHAPED)])
+    else:
+        known = cKDTree(inputs.tracks[0]).query(vertices)[0] < TRACK_REACH_MM
+    mesh, record = fit_outline(inputs.mesh, faces_of(inputs, OUTLINED), known, outlines, settings, note)
+    placed = move_without_crossing(vertices, mesh.vertices, mesh.faces)
+    return Reshaped(inputs, mesh.replace(vertices=placed)), record
 
 
 def reshape(

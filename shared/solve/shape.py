@@ -23,7 +23,7 @@ from shared.solve.capture import Scenery, Sizes, face_front, set_scenery
 from shared.solve.fit_appearance import Solution
 from shared.solve.local_roughness import GlossEquations
 from shared.solve.shape_equations import EquationSettings, PointEquations, point_equations
-from shared.solve.shape_samples import gather_surface
+from shared.solve.shape_samples import SurfaceView, gather_surface, look_at_surface
 from shared.solve.shape_step import (
     LARGEST_STEP_EDGES,
     TrackPoints,
@@ -33,7 +33,8 @@ from shared.solve.shape_step import (
     solve_offsets,
     track_rows,
 )
-from shared.solve.shape_terms import shading_terms
+from shared.solve.shape_terms import Reflections, shading_terms
+from shared.solve.silhouette import RimSettings
 from shared.transfer import Nodes, Transfer, mesh_points, nearest_points
 
 SHAPED = ("forehead", "brows", "lids", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "lips", "chin", "jaw")
@@ -48,8 +49,9 @@ BLUR_EDGES = 0.4
 
 @dataclass(frozen=True)
 class ShapeSettings:
-    """subdivisions: finer levels beyond the given mesh; rounds: most steps per level; smoothness: lambda of the large
-    steps; sigma_mm: how far the surface may be from the start as a whole; frames: that the shape is solved from."""
+    """subdivisions: finer levels beyond the given mesh; rounds: most steps per level; frames: that the shape is solved
+    from; smoothness: lambda of the large steps; sigma_mm: how far the surface may be from the start as a whole; rim:
+    how the outline is met first, None: it is not."""
 
     subdivisions: int = 1
     rounds: int = 2
@@ -57,6 +59,7 @@ class ShapeSettings:
     smoothness: float = 19.0
     sigma_mm: float = 8.0
     equations: EquationSettings = field(default_factory=EquationSettings)
+    rim: RimSettings | None = field(default_factory=RimSettings)
 
 
 @dataclass(frozen=True)
@@ -105,17 +108,18 @@ class Surface:
 
 @dataclass(frozen=True)
 class Traced:
-    """The transfer of vertices index [P], traced once per level: steps move the surface by far less than what it sees
-    is away."""
+    """What is looked up once per level, since steps move the surface by far less than what it sees is away: the
+    transfer of vertices index [P], how the frames see them, and what they reflect (None: nothing)."""
 
     scenery: Scenery
     index: np.ndarray
     transfer: Transfer
+    views: list[SurfaceView]
+    reflections: Reflections | None
 
     def turned_to(self, normals: np.ndarray) -> Transfer:
         """The transfer for other normals [P, 3] under the same visibility."""
-        directions = self.scenery.directions
-        cosine = np.maximum(normals @ directions.T, 0.0) * (4.0 / len(directions))
+        cosine = np.maximum(normals @ self.scenery.directions.T, 0.0) * (4.0 / len(self.scenery.directions))
         return replace(self.transfer, direct=(cosine * self.transfer.visibility()).astype(np.float16))
 
 
@@ -137,30 +141,36 @@ class ShapeSolver:
         self.appearance, self.sizes, self.settings, self.note = appearance, sizes, settings, note
 
     def trace(self, mesh: Mesh, shaped: np.ndarray) -> Traced:
-        """What the shaped faces' vertices that some frame faces see of the sphere and of the head."""
+        """Looks at the shaped faces' vertices that some frame faces."""
+        clip = self.clip
         viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
         scenery = set_scenery(viewer, self.sizes, self.appearance.visibility)
         wanted = np.zeros(len(mesh.vertices), bool)
         wanted[mesh.faces[shaped]] = True
-        index = np.nonzero(wanted & face_front(viewer, self.clip.camera_from_head, 0.2))[0]
-        return Traced(scenery, index, scenery.trace(mesh_points(mesh, index)))
+        index = np.nonzero(wanted & face_front(viewer, clip.camera_from_head, 0.2))[0]
+        transfer = scenery.trace(mesh_points(mesh, index))
+        blur = BLUR_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
+        pictures = read_ahead(map(clip.picture, self.progress(range(len(clip.camera_from_head)), "shape, sampling")))
+        views = look_at_surface(viewer, index, pictures, clip.camera_from_head, clip.intrinsics, blur)
+        traced = Traced(scenery, index, transfer, views, None)
+        if not self.appearance.specular or len(index) < FEWEST_POINTS:
+            return traced
+        shading = self._shade(mesh, traced, mesh_points(mesh, index), transfer)
+        return replace(traced, reflections=Reflections(shading, np.arange(len(index))))
 
     def examine(self, mesh: Mesh, shaped: np.ndarray, traced: Traced) -> Surface | None:
         """Samples, shading and equations of the traced vertices; None where hardly any is seen."""
         clip, settings, index = self.clip, self.settings, traced.index
-        viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
-        pictures = read_ahead(map(clip.picture, self.progress(range(len(clip.camera_from_head)), "shape, sampling")))
-        blur = BLUR_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
-        samples = gather_surface(viewer, index, pictures, clip.camera_from_head, clip.intrinsics, blur)
         points = mesh_points(mesh, index)
+        samples = gather_surface(points.positions, traced.views, clip.camera_from_head, clip.intrinsics)
         transfer = traced.turned_to(points.normals)
         seen = (samples.weight[:, clip.fitted] > 0).sum(1) >= min(MINIMUM_FRAMES, int(clip.fitted.sum()))
         rows = np.nonzero(seen & (transfer.blocked < DEEP))[0]
         if len(rows) < FEWEST_POINTS:
             return None
-        shading = self._shade(mesh, traced.scenery, index, points, transfer)
+        shading = self._shade(mesh, traced, points, transfer)
         samples = samples.points(rows)
-        terms = shading_terms(shading, rows, self.appearance.specular)
+        terms = shading_terms(shading, rows, traced.reflections)
         points = points.take(rows)
         spacing_px = typical_edge(mesh.vertices, mesh.faces[shaped]) * pixels_per_mm(clip)
         equations = point_equations(
@@ -175,12 +185,12 @@ class ShapeSolver:
         )
         return Surface(mesh, index[rows], terms.tangents, equations)
 
-    def _shade(self, mesh, scenery, index, points, transfer) -> VertexShading:
-        known = self.reflectance
+    def _shade(self, mesh, traced: Traced, points, transfer) -> VertexShading:
+        known, scenery = self.reflectance, traced.scenery
         local = None if known.gloss is None else known.gloss.roughness(points.positions)
         node_albedo = known.node_albedo[nearest_points(scenery.nodes.points, known.nodes.points)]
         return VertexShading(
-            index,
+            traced.index,
             mesh.vertices,
             points,
             transfer,

@@ -24,7 +24,7 @@ from shared.solve.shape_samples import SurfaceSamples
 from shared.solve.shape_terms import ShadingTerms
 from shared.transfer import spread_vertices
 
-MINIMUM_ALBEDO, MAXIMUM_ALBEDO = 0.003, 1.0
+MINIMUM_ALBEDO, MAXIMUM_ALBEDO, TYPICAL_ALBEDO = 0.003, 1.0, 0.3
 CAUCHY_SCALE = 2.5
 LARGEST_SQUARED_ERROR = 0.01
 """A sample that is off by more than a tenth of full scale shows something else than the surface."""
@@ -75,6 +75,8 @@ class EquationSettings:
     noise: tuple[float, float] = (0.006, 0.03)
     correlated: float = 5.0
     smooth_mm: float = 12.0
+    shadow_mm: float = 2.5
+    local: float = 0.0
 
 
 def point_equations(
@@ -91,7 +93,8 @@ def point_equations(
     many independent points one counts as, where they are denser than the pictures resolve."""
     specular = np.broadcast_to(np.asarray(specular, np.float32), (len(points),))[:, None, None]
     gloss = specular * terms.reflection
-    albedo, weight = _fit_albedo(samples, terms.irradiance, gloss, fitted, settings.noise)
+    doubt = settings.shadow_mm * terms.shadow_slope
+    albedo, weight = _fit_albedo(samples, terms.irradiance, gloss, fitted, settings.noise, doubt)
     model = albedo[:, None] * terms.irradiance + gloss
     error = model - samples.colours
     rms = _rms(error, samples, fitted)
@@ -108,9 +111,11 @@ def point_equations(
     weighted = weight * terms.irradiance
     slopes -= terms.irradiance[..., None] * ((weighted[..., None] * slopes).sum(1) / power[..., None])[:, None]
     error -= terms.irradiance * ((weighted * error).sum(1) / power)[:, None]
-    count = np.maximum((weight > 0).sum(), 1)
-    misfit = max(1.0, float((weight * error**2).sum() / count))
-    evidence = share / (misfit * settings.correlated)
+    misfit = (weight * error**2).sum((1, 2)), (weight > 0).sum((1, 2))
+    whole = max(1.0, float(misfit[0].sum() / max(misfit[1].sum(), 1)))
+    if settings.local > 0:
+        whole = np.maximum(whole, (misfit[0] / np.maximum(misfit[1], 1)) ** settings.local)
+    evidence = np.broadcast_to(share / (whole * settings.correlated), (len(points),))[:, None, None]
     rows = slopes.reshape(len(slopes), -1, 3)
     scaled = rows * (evidence * weight).reshape(len(slopes), -1, 1)
     hessian = np.swapaxes(scaled, 1, 2) @ rows
@@ -118,9 +123,10 @@ def point_equations(
     return PointEquations(hessian.astype(np.float64), gradient.astype(np.float64), albedo, *rms)
 
 
-def _fit_albedo(samples, irradiance, gloss, fitted, noise) -> tuple[np.ndarray, np.ndarray]:
-    """Albedo [P, 3] of the fitted frames and robust, censored weights [P, F, 3] of all."""
-    sigma = noise[0] + noise[1] * samples.colours
+def _fit_albedo(samples, irradiance, gloss, fitted, noise, doubt) -> tuple[np.ndarray, np.ndarray]:
+    """Albedo [P, 3] of the fitted frames and robust, censored weights [P, F, 3] of all; doubt [P, F, 3]: standard
+    deviation of the irradiance."""
+    sigma = np.hypot(noise[0] + noise[1] * samples.colours, TYPICAL_ALBEDO * doubt)
     base = samples.weight[..., None] / sigma**2
     weight = base * (samples.limits == 0)
     for _ in range(3):

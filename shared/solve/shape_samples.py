@@ -13,7 +13,12 @@ import cv2
 import numpy as np
 
 from shared.gather import Picture, SurfaceViewer, remap, sample_inside, sample_limits
+from shared.geometry import project
 from shared.mesh import normalised
+
+LEAST_BLUR_PX = 0.3
+MARGIN_PX = 8
+"""Around the part of a picture that shows the points: farther no step moves them."""
 
 
 @dataclass(frozen=True)
@@ -54,47 +59,70 @@ def projection_slope(points: np.ndarray, camera_from_head: np.ndarray, intrinsic
     return slope @ camera_from_head[:3, :3]
 
 
-def picture_and_gradient(picture: Picture, sigma_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The blurred picture and its derivatives along x and along y per pixel, each [H, W, 3] float32."""
-    image = picture.levels[0]
-    if sigma_px > 0.3:
-        image = cv2.GaussianBlur(image, (0, 0), sigma_px)
-    # Central differences see what linear interpolation between the pixels will.
-    along_x = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
-    along_y = cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
-    return image, along_x, along_y
+@dataclass(frozen=True)
+class SurfaceView:
+    """What P points need of a frame: the part of the picture that shows them, blurred and in half floats, whose first
+    pixel is at origin (x, y); weight [P] (0: not seen)."""
+
+    picture: Picture
+    origin: tuple[int, int]
+    weight: np.ndarray
 
 
-def gather_surface(
+def look_at_surface(
     viewer: SurfaceViewer,
     index: np.ndarray,
     pictures: Iterable[Picture],
     camera_from_head: np.ndarray,
     intrinsics: np.ndarray,
     blur_mm: float,
-) -> SurfaceSamples:
-    """Samples of the vertices index [P] in F frames.
+) -> list[SurfaceView]:
+    """The vertices index [P] in F frames, as often as they are then sampled after small moves.
 
     pictures: F, read once in order; camera_from_head [F, 4, 4]; intrinsics [3, 3] or [F, 3, 3]; blur_mm: standard
     width of the blur on the surface.
     """
-    shape = (len(index), len(camera_from_head))
-    intrinsics = np.broadcast_to(intrinsics, (len(camera_from_head), 3, 3))
+    views, intrinsics = [], np.broadcast_to(intrinsics, (len(camera_from_head), 3, 3))
+    for pose, lens, picture in zip(camera_from_head, intrinsics, pictures, strict=True):
+        view = viewer.view(pose, lens, picture.inside.shape[::-1])
+        weight = view.weight[index]
+        seen = index[weight > 0]
+        if len(seen) == 0:
+            views.append(SurfaceView(picture, (0, 0), weight))
+            continue
+        sigma = blur_mm * float(lens[0, 0]) / float(np.median(view.depth[seen]))
+        low = np.maximum(np.floor(view.pixels[seen].min(0)).astype(int) - MARGIN_PX, 0)
+        high = np.ceil(view.pixels[seen].max(0)).astype(int) + MARGIN_PX
+        part = slice(low[1], high[1]), slice(low[0], high[0])
+        image = picture.levels[0]
+        if sigma > LEAST_BLUR_PX:
+            image = cv2.GaussianBlur(image, (0, 0), sigma)
+        cut = Picture((image[part].astype(np.float16),), picture.limits[part].copy(), picture.inside[part].copy())
+        views.append(SurfaceView(cut, (int(low[0]), int(low[1])), weight))
+    return views
+
+
+def gather_surface(
+    positions: np.ndarray, views: list[SurfaceView], camera_from_head: np.ndarray, intrinsics: np.ndarray
+) -> SurfaceSamples:
+    """Samples of P points [P, 3] in F frames [F, 4, 4]; intrinsics [3, 3] or [F, 3, 3]."""
+    shape = (len(positions), len(camera_from_head))
     colours, limits = np.zeros(shape + (3,), np.float32), np.zeros(shape + (3,), np.int8)
     gradient = np.zeros(shape + (3, 2), np.float16)
     slope, weight = np.zeros(shape + (2, 3), np.float32), np.zeros(shape, np.float32)
-    for f, picture in enumerate(pictures):
-        pose, lens = camera_from_head[f], intrinsics[f]
-        view = viewer.view(pose, lens, picture.inside.shape[::-1])
-        seen = np.nonzero(view.weight[index] > 0)[0]
+    intrinsics = np.broadcast_to(intrinsics, (len(camera_from_head), 3, 3))
+    for f, (view, pose, lens) in enumerate(zip(views, camera_from_head, intrinsics, strict=True)):
+        seen = np.nonzero(view.weight > 0)[0]
         if len(seen) == 0:
             continue
-        pixels = view.pixels[index[seen]]
-        sigma = blur_mm * float(lens[0, 0]) / float(np.median(view.depth[index[seen]]))
-        colour, along_x, along_y = (remap(image, pixels) for image in picture_and_gradient(picture, sigma))
-        colours[seen, f] = np.maximum(colour, 0.0)
-        gradient[seen, f] = np.stack([along_x, along_y], axis=-1)
-        slope[seen, f] = projection_slope(viewer.mesh.vertices[index[seen]], pose, lens)
-        limits[seen, f] = sample_limits(picture, pixels)
-        weight[seen, f] = view.weight[index[seen]] * sample_inside(picture, pixels)
+        points, image = positions[seen], view.picture.levels[0].astype(np.float32)
+        pixels = project(points, pose, lens)[0] - view.origin
+        # Central differences see what linear interpolation between the pixels will.
+        along_x = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
+        along_y = cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
+        colours[seen, f] = np.maximum(remap(image, pixels), 0.0)
+        gradient[seen, f] = np.stack([remap(along_x, pixels), remap(along_y, pixels)], axis=-1)
+        slope[seen, f] = projection_slope(points, pose, lens)
+        limits[seen, f] = sample_limits(view.picture, pixels)
+        weight[seen, f] = view.weight[seen] * sample_inside(view.picture, pixels)
     return SurfaceSamples(colours, gradient, slope, weight, limits)

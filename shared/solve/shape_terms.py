@@ -22,23 +22,26 @@ from shared.lobes import specular_reflection
 from shared.mesh import normalised
 from shared.shading import VertexShading
 from shared.solve.shape_samples import tangent_frames
-from shared.transfer import position_and_normal, spread_vertices
+from shared.transfer import Points, position_and_normal, spread_vertices
 
 NORMAL_STEP = 0.06
 """Radians between the normals whose reflections are differenced: half the spacing of 768 directions."""
 ANCHORS = 3000
+NEIGHBOURS, CLOSEST_MM = 4, 0.5
 
 
 @dataclass(frozen=True)
 class ShadingTerms:
     """P points, F frames: irradiance E over pi and reflection S at specular_intensity 1, [P, F, 3] each, and their
-    derivatives irradiance_turn and reflection_turn [P, F, 3, 2] by a turn of the normal towards tangents [P, 2, 3]."""
+    derivatives irradiance_turn and reflection_turn [P, F, 3, 2] by a turn of the normal towards tangents [P, 2, 3];
+    shadow_slope [P, F, 3]: change of E per mm along the surface that the normal does not explain."""
 
     tangents: np.ndarray
     irradiance: np.ndarray
     reflection: np.ndarray
     irradiance_turn: np.ndarray
     reflection_turn: np.ndarray
+    shadow_slope: np.ndarray
 
 
 class IrradianceVectors:
@@ -57,7 +60,10 @@ class IrradianceVectors:
 
 
 class Reflections:
-    """S and its derivative by the normal, at rows [P] of the shading's points."""
+    """S and its derivative by the normal, at rows [P] of the shading's points.
+
+    What is summed at the anchors is kept: after small moves the points' new normals are carried from the same anchors.
+    """
 
     def __init__(self, shading: VertexShading, rows: np.ndarray):
         self.shading, points = shading, shading.points
@@ -72,13 +78,18 @@ class Reflections:
         weight = 1.0 / (distance + 0.3) ** 2
         weight /= weight.sum(1, keepdims=True)
         entries = np.repeat(np.arange(len(rows)), which.shape[1]), which.ravel()
+        self._known: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self.carry = sparse.csr_matrix((weight.ravel(), entries), (len(rows), len(self.anchors)))
 
-    def at(self, frame: int, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """S [P, 3] of points with normals [P, 3] and its derivative by them [P, 3 channels, 3]."""
-        value, slope = self._at_anchors(frame)
+    def at(
+        self, frame: int, normals: np.ndarray, rows: slice | np.ndarray = slice(None)
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """S [n, 3] of some of the P points with normals [n, 3] and its derivative by them [n, 3 channels, 3]."""
+        if frame not in self._known:
+            self._known[frame] = self._at_anchors(frame)
+        value, slope = self._known[frame]
         level = value - np.einsum("acx,ax->ac", slope, self.normals)
-        both = self.carry @ np.concatenate([level, slope.reshape(-1, 9)], axis=1)
+        both = self.carry[rows] @ np.concatenate([level, slope.reshape(-1, 9)], axis=1)
         slope = both[:, 3:].reshape(-1, 3, 3)
         return np.maximum(both[:, :3] + np.einsum("pcx,px->pc", slope, normals), 0.0), slope
 
@@ -100,18 +111,34 @@ class Reflections:
         return value, slope
 
 
-def shading_terms(shading: VertexShading, rows: np.ndarray, with_specular: bool) -> ShadingTerms:
-    """Terms of the shading's points rows [P] in all its frames."""
+def shading_terms(shading: VertexShading, rows: np.ndarray, reflections: Reflections | None) -> ShadingTerms:
+    """Terms of the shading's points rows [P] in all its frames; reflections: of all its points, None: there are none.
+    """
     normals = shading.points.normals[rows]
     tangents = tangent_frames(normals).astype(np.float32)
     vectors = IrradianceVectors(shading.transfer.visibility(rows), shading.directions, shading.light_along)
-    turn = np.einsum("pfcx,pkx->pfck", vectors.frames(slice(None)), tangents)
+    along = vectors.frames(slice(None))
+    turn = np.einsum("pfcx,pkx->pfck", along, tangents)
+    shadow = shadow_slope(shading.points.take(rows), along)
     shape = (len(rows), shading.light_along.shape[1], 3)
     reflection, reflection_turn = np.zeros(shape, np.float32), np.zeros(shape + (2,), np.float32)
-    if with_specular:
-        reflections = Reflections(shading, rows)
+    if reflections is not None:
         for f in range(shape[1]):
-            reflection[:, f], slope = reflections.at(f, normals)
+            reflection[:, f], slope = reflections.at(f, normals, rows)
             reflection_turn[:, f] = np.einsum("pcx,pkx->pck", slope, tangents)
-    return ShadingTerms(tangents, shading.irradiance_of_points(rows), reflection, turn, reflection_turn)
+    return ShadingTerms(tangents, shading.irradiance_of_points(rows), reflection, turn, reflection_turn, shadow)
+
+
+def shadow_slope(points: Points, vectors: np.ndarray) -> np.ndarray:
+    """[P, F, 3]: rms change of n . W per mm towards the nearest points, n held: where the borders of cast shadows lie.
+
+    vectors [P, F, 3 channels, 3]: W. Where a border lies is known no better than visibility and shape are.
+    """
+    distance, near = cKDTree(points.positions).query(points.positions, k=min(1 + NEIGHBOURS, len(points)))
+    total = np.zeros(vectors.shape[:3], np.float32)
+    for k in range(1, near.shape[1]):
+        between = normalised(points.normals + points.normals[near[:, k]]).astype(np.float32)
+        change = np.einsum("pfcx,px->pfc", vectors[near[:, k]] - vectors, between)
+        total += np.square(change / np.maximum(distance[:, k], CLOSEST_MM)[:, None, None].astype(np.float32))
+    return np.sqrt(total / NEIGHBOURS)
 

@@ -1,0 +1,71 @@
+"""The shape for people: the refined mesh shaded and as normals, the start, and how far the one lies from the other."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from shared.geometry import WORLD_FROM_CAMERA, rigid, rotation_from_vector
+from shared.mesh import Mesh, interpolate, normalised, vertex_normals
+from shared.raycast import RayScene, camera_hits
+
+YAWS_DEG = (0.0, -40.0, -90.0)
+"""Front, three-quarter and side."""
+LAMP = normalised(np.array([-0.6, 0.5, 0.6]))
+"""Where the light comes from, in the camera's space turned y up."""
+LARGEST_DIFFERENCE_MM = 1.0
+DISTANCE = 8.0
+"""The camera's distance in heights of the face: next to no perspective."""
+BACKDROP, INK = 34, (225, 225, 225)
+SAMPLES = 2
+
+
+def shape_sheet(start: Mesh, mesh: Mesh, face: np.ndarray | None, size: int = 400) -> np.ndarray:
+    """uint8 [4 size, 3 size, 3]: rows start, mesh, its normals, difference; front, three-quarter and side.
+
+    The meshes share their topology; face [faces] bool: what the pictures are centred on, None: all.
+    """
+    inside = mesh.vertices if face is None else mesh.vertices[np.unique(mesh.faces[face])]
+    low, high = inside.min(0), inside.max(0)
+    centre, extent = 0.5 * (low + high), 1.25 * float((high - low)[1])
+    normals = vertex_normals(start.vertices, start.faces)
+    raised = ((mesh.vertices - start.vertices) * normals).sum(1)
+    columns = [_views(start, mesh, raised, np.radians(yaw), centre, extent, size) for yaw in YAWS_DEG]
+    sheet = np.concatenate(columns, axis=1)
+    names = ("start", "refined", "normals", f"refined - start: red {LARGEST_DIFFERENCE_MM:g} mm out, blue in")
+    for row, name in enumerate(names):
+        place = 8, row * size + 18
+        cv2.putText(sheet, name, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
+    return sheet
+
+
+def _views(start, mesh, raised, yaw, centre, extent, size) -> np.ndarray:
+    """The four pictures of one direction, [4 size, size, 3]."""
+    turn = WORLD_FROM_CAMERA @ rotation_from_vector(np.array([0.0, yaw, 0.0]))
+    pose = rigid(turn, -turn @ centre + [0.0, 0.0, DISTANCE * extent])
+    lens = np.array([[DISTANCE * size, 0.0, size / 2], [0.0, DISTANCE * size, size / 2], [0.0, 0.0, 1.0]])
+    to_picture = turn.T @ WORLD_FROM_CAMERA
+    before, after = (vertex_normals(shown.vertices, shown.faces) @ to_picture for shown in (start, mesh))
+    share = np.clip(raised / LARGEST_DIFFERENCE_MM, -1.0, 1.0)[:, None]
+    difference = 1.0 - np.maximum(share, 0.0) * [0.0, 1.0, 1.0] + np.minimum(share, 0.0) * [1.0, 1.0, 0.0]
+    pictures = [_drawn(start, _shade(before), pose, lens, size)]
+    values = np.concatenate([_shade(after), 0.5 * after + 0.5, difference], axis=1)
+    pictures.append(_drawn(mesh, values, pose, lens, size))
+    return np.concatenate([pictures[0], *np.split(pictures[1], 3, axis=2)])
+
+
+def _shade(normals: np.ndarray) -> np.ndarray:
+    return np.repeat(0.1 + 0.85 * np.maximum(normals @ LAMP, 0.0)[:, None], 3, axis=1)
+
+
+def _drawn(mesh: Mesh, values: np.ndarray, pose: np.ndarray, lens: np.ndarray, size: int) -> np.ndarray:
+    """Vertex values [V, C] in 0 .. 1 as the camera sees them, uint8 [size, size, C]."""
+    scene, total = RayScene(mesh.vertices, mesh.faces), 0.0
+    for offset in np.ndindex(SAMPLES, SAMPLES):
+        offsets = tuple((np.array(offset) + 0.5) / SAMPLES)
+        face, bary, _ = camera_hits(scene, pose, lens, size, size, offsets)
+        picture = np.full((size, size, values.shape[1]), BACKDROP / 255.0)
+        hit = face >= 0
+        picture[hit] = interpolate(values, mesh.faces, face[hit], bary[hit])
+        total = total + picture / SAMPLES**2
+    return np.clip(np.round(total * 255.0), 0, 255).astype(np.uint8)
