@@ -10,6 +10,7 @@ import sys
 import pytest
 from toy_runs import REPOSITORY, copy_pipeline, limn, make_subject, outputs_of, tree
 
+from shared.contract.needs import Scale, measured_scale
 from shared.contract.pipeline import load_pipeline
 from shared.contract.subject import load_subject
 from shared.errors import InputError
@@ -167,6 +168,16 @@ def test_a_clip_at_fault_is_named_and_keeps_the_rest_from_running(tmp_path, pipe
     outcome = json.loads((tmp_path / "summary.json").read_text())["subjects"][0]
     assert (outcome["state"], outcome["stage"]) == ("input error", "lamp/read_text") and outcome["bytes"] > 0
     assert (subject / "work" / "clips" / "sun" / "work" / "draw_bars").is_dir()
+
+
+def test_work_on_all_clips_books_for_the_frames_of_all(tmp_path):
+    for clip, frames, size in (("sun", 30, [100, 400]), ("lamp", 12, [300, 300])):
+        folder = tmp_path / "work" / "clips" / clip / "work" / "sample_frames"
+        folder.mkdir(parents=True)
+        (folder / "frames.json").write_text(json.dumps({"size": size, "frames": [0] * frames}))
+    assert measured_scale(tmp_path, Scale(150, 1024, 512)) == Scale(42, 300, 512)
+    assert measured_scale(tmp_path / "work" / "clips" / "sun", Scale(150, 1024, 512)) == Scale(30, 200, 512)
+    assert measured_scale(tmp_path / "gone", Scale(150, 1024, 512)) == Scale(150, 1024, 512)
 
 
 def test_status_and_clean_see_all_clips(finished, tmp_path, capsys):
