@@ -5,8 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_local_roughness import glossy_forehead, solver_under_true_light
-from toy_capture import NOISE, ROUGHNESS, even_light, hard_light, make_truth
+from toy_capture import (
+    NOISE,
+    ROUGHNESS,
+    even_light,
+    glossy_forehead,
+    hard_light,
+    make_truth,
+    solver_under_true_light,
+)
 from toy_head import toy_head
 
 from shared.errors import InputError

@@ -2,28 +2,12 @@
 
 import numpy as np
 import pytest
-from toy_capture import ROUGHNESS, SPECULAR, make_truth, true_albedo, true_light
+from toy_capture import ROUGHNESS, SPECULAR, glossy_forehead, make_truth, solver_under_true_light
 
-from shared.envmap import cube_directions
 from shared.solve import local_roughness as module
-from shared.solve.appearance import AppearanceSolver, Settings
 from shared.solve.local_roughness import GlossEquations, local_roughness
 
 LOGS = np.log(ROUGHNESS) + np.log(module.FACTOR) * np.arange(-module.STEPS, module.STEPS + 1)
-
-
-def solver_under_true_light(capture):
-    """All unknowns but the roughness as they are."""
-    solver = AppearanceSolver(capture, Settings(resolutions=(16,), noise=(0.003, 0.01), roughness=ROUGHNESS))
-    solver.state.params, solver.state.specular = np.log(true_light(cube_directions(16))), SPECULAR
-    solver.state.node_albedo = true_albedo(capture.nodes.points.positions)
-    solver.state.albedo = true_albedo(capture.points.positions)
-    return solver
-
-
-def glossy_forehead(positions):
-    """A third less rough above the eyes, a third rougher below, the same on average over all points."""
-    return np.where(positions[:, 1] > np.median(positions[:, 1]), 0.8, 1.25) * ROUGHNESS
 
 
 def test_a_glossy_half_is_found_and_kept():

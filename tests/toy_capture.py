@@ -13,7 +13,7 @@ from shared.lobes import LobeTable, specular_reflection
 from shared.mesh import normalised
 from shared.raycast import RayScene
 from shared.shading import light_along
-from shared.solve.appearance import Capture
+from shared.solve.appearance import AppearanceSolver, Capture, Settings
 from shared.transfer import bounce_nodes, irradiance, mesh_points, node_radiosity, trace_transfer
 
 FRAMES, ROUGHNESS, SPECULAR, NOISE = 14, 0.4, 0.7, 0.002
@@ -93,3 +93,17 @@ def make_truth(
     index = np.nonzero(seen)[0]
     parts = {"points": points.take(index), "samples": samples.points(index), "transfer": transfer.take(index)}
     return replace(capture, **parts, skin=skin[index]), albedo[index], light[index]
+
+
+def solver_under_true_light(capture):
+    """All unknowns but the roughness as they are."""
+    solver = AppearanceSolver(capture, Settings(resolutions=(16,), noise=(0.003, 0.01), roughness=ROUGHNESS))
+    solver.state.params, solver.state.specular = np.log(true_light(cube_directions(16))), SPECULAR
+    solver.state.node_albedo = true_albedo(capture.nodes.points.positions)
+    solver.state.albedo = true_albedo(capture.points.positions)
+    return solver
+
+
+def glossy_forehead(positions):
+    """A third less rough above the eyes, a third rougher below, the same on average over all points."""
+    return np.where(positions[:, 1] > np.median(positions[:, 1]), 0.8, 1.25) * ROUGHNESS
