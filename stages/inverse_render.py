@@ -64,7 +64,7 @@ STAGE = Stage(
         Parameter("model", str, "full", "Solve the full model that the other parameters describe, or climb towards it "
                   "only as far as held-out frames fit better for it.", choices=MODELS),
         Parameter("forced", str, "", "Parts of the model that model=auto leaves as the other parameters say, separated "
-                  "by commas: visibility, specular, light, geometry."),
+                  "by commas: visibility, specular, light, geometry, roughness."),
         Parameter("points", int, 4000, "Surface points that the light is solved from.", "", 200, 40000),
         Parameter("directions", int, 768, "Directions over the sphere.", "", 128, 8192),
         Parameter("bounce_nodes", int, 1000, "Surface nodes that exchange bounced light.", "", 50, 6000),

@@ -146,7 +146,7 @@ class Ladder:
         """Goes up one part as far as it serves."""
         names, climbed, missed = self.rungs[part], False, 0
         place = names.index(getattr(self.present.model, part))
-        while missed < LOOK_AHEAD and place + 1 < len(names):
+        while missed < self._patience(part) and place + 1 < len(names):
             place += 1
             model = self.present.model._replace(**{part: names[place]})
             if model in self.tried:
@@ -167,6 +167,10 @@ class Ladder:
                 missed += 1
         return climbed
 
+    def _patience(self, part: str) -> int:
+        """How many rungs in a row may not serve: a cubemap that a finer one does not improve is fine enough."""
+        return 1 if part == "light" and self.present.model.light.startswith("cubemap") else LOOK_AHEAD
+
     def _at_bottom(self) -> bool:
         """Whether nothing but the visibility has climbed."""
         return all(getattr(self.present.model, part) == self.rungs[part][0] for part in ("specular", "light"))
@@ -178,7 +182,7 @@ class Ladder:
             start = Solution(AppearanceSolver(capture, settings).state, (), np.inf, np.inf)
         if settings.specular and start.state.specular == 0.0:
             fresh = replace(start.state, specular=settings.specular_prior[0], roughness=settings.roughness)
-            start = replace(start, state=fresh)
+            start = replace(start, state=fresh, trusted=True)
         solution = fit_appearance(capture, settings, start=start, keep_start=keep_start)
         errors = solution.frame_errors[~capture.fitted]
         return Trial(model, solution, errors, time.perf_counter() - begun)
