@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,10 +20,14 @@ from toy_head import toy_head
 from shared.errors import InputError
 from shared.report.gather import ladder_record
 from shared.report.model_sections import climbed_table
+from shared.solve import ladder_clip
 from shared.solve.appearance import Settings
 from shared.solve.fit_appearance import Solution
+from shared.solve.inverse import InverseSettings
 from shared.solve.ladder import LIGHTS, Ladder, Model, Trial, allowed_rungs, gain, serves
+from shared.solve.ladder_clip import climb
 from shared.solve.ladder_gloss import VARIATIONS, Gloss, GlossLadder, segments_at
+from shared.solve.shape import ShapeSettings
 from stages.inverse_render import STAGE, read_forced, read_settings
 
 CAREFUL = Settings(resolutions=(8, 16), noise=(0.003, 0.01))
@@ -164,6 +169,71 @@ def test_a_model_becomes_the_solvers_settings():
     assert (camera.light_model, camera.resolutions) == ("camera", (16,))
     coarse = Model("off", "none", "cubemap").applied(Settings(resolutions=(4,)))
     assert (coarse.light_model, coarse.resolutions) == ("cubemap", (4,))
+
+
+class Seen:
+    """A clip's small captures as they are given, in the place of ladder_clip.SmallClip."""
+
+    def __init__(self, inputs, *_):
+        self.inputs, self.sizes = inputs, None
+        self.captures = {visible: inputs.capture for visible in (False, True)}
+        self.scenery = dict.fromkeys(self.captures, SimpleNamespace(nodes=None))
+
+
+def noisy(capture, sigma):
+    colours = capture.samples.colours + sigma * np.random.default_rng(1).normal(size=capture.samples.colours.shape)
+    return replace(capture, samples=replace(capture.samples, colours=colours.astype(np.float32)))
+
+
+MATTE = Settings(resolutions=(8,), light_model="harmonics_2", specular=False, noise=(0.003, 0.01))
+
+
+def clip_of(capture):
+    return SimpleNamespace(capture=capture, mesh=None, face_segment=np.zeros(1), camera_from_head=np.zeros((14, 4, 4)))
+
+
+def climb_meshes(monkeypatch, qualities, **settings):
+    """What the clip's ladder leads to if a mesh of each number of subdivisions leaves so much noise."""
+    capture, asked = make_truth(specular=0.0)[0], []
+
+    def reshape(tracked, frames, known, appearance, sizes, shape, progress, note, begun):
+        asked.append((shape.subdivisions, begun))
+        return SimpleNamespace(**{**vars(tracked), "capture": noisy(capture, qualities[1 + shape.subdivisions]),
+                                  "mesh": f"level {shape.subdivisions}"})
+
+    monkeypatch.setattr(ladder_clip, "SmallClip", Seen)
+    monkeypatch.setattr(ladder_clip, "reshape", reshape)
+    monkeypatch.setattr(ladder_clip, "frames_of", lambda *_: None)
+    whole = InverseSettings(appearance=MATTE, ladder=frozenset(), shape=ShapeSettings(subdivisions=1), **settings)
+    fitted = np.ones(14, bool)
+    return climb(clip_of(noisy(capture, qualities[0])), whole, fitted, None, None, lambda text: None), asked
+
+
+def test_the_mesh_is_refined_as_far_as_it_serves(one_thread, monkeypatch):
+    climbed, asked = climb_meshes(monkeypatch, (0.02, 0.005, 0.02))
+    assert climbed.inputs.mesh == "level 0" and climbed.settings.shape is None
+    assert asked == [(0, None), (1, "level 0")]  # the second goes on where the first ended
+    assert climbed.shape_record["refined"]
+    assert climbed.shape_record["held_out"]["after"] < 0.5 * climbed.shape_record["held_out"]["before"]
+    meshes = [(rung["rung"], rung["climbed"]) for rung in climbed.rungs if rung["part"] == "geometry"]
+    assert meshes == [("refined", True), ("subdivided_1", False)]
+    assert climbed.settings.appearance.specular is False and climbed.start.held_out > 0.0
+
+
+def test_a_tracked_mesh_that_no_refinement_improves_stays(one_thread, monkeypatch):
+    climbed, asked = climb_meshes(monkeypatch, (0.01, 0.01, 0.005))
+    assert climbed.inputs.mesh is None and climbed.shape_record == {"refined": False}
+    assert asked == [(0, None)]
+
+
+def test_too_few_held_out_frames_choose_no_model(one_thread, monkeypatch):
+    capture = make_truth(specular=0.0)[0]
+    monkeypatch.setattr(ladder_clip, "SmallClip", Seen)
+    notes, whole = [], InverseSettings(appearance=MATTE, ladder=frozenset())
+    two = clip_of(replace(capture, fitted=np.arange(14) > 1))
+    climbed = climb(two, whole, np.ones(14, bool), None, None, notes.append)
+    assert climbed.start is None and climbed.rungs == () and climbed.settings == replace(whole, ladder=None)
+    assert "2 frames are too few" in notes[0]
 
 
 class Told:

@@ -72,7 +72,7 @@ def climb(
     climber = _Climber(inputs, settings, fitted, chart, progress, note)
     if climber.held_out < FEWEST_HELD_OUT:
         note(f"the model is not chosen: {climber.held_out} frames are too few to judge it by; all of it is solved")
-        return Climbed(inputs, settings)
+        return Climbed(inputs, replace(settings, ladder=None))
     climber.climb()
     return climber.climbed()
 
