@@ -33,8 +33,7 @@ LEAST_MODEL = 0.01
 def signs_of(capture: Capture, settings: Settings, solution: Solution) -> dict[str, float]:
     """{"frame_gain", "frame_tint", "albedo_by_orientation", "unlikely_colour"} of a solution of its capture."""
     solver = AppearanceSolver(capture, settings)
-    solver.state = replace(solution.state)
-    solver.set_light((settings.light_model, solution.state.light_model.resolution))
+    solver.take_state(replace(solution.state))
     solver.bake()
     part = solver.subset(slice(None, None, -(-len(capture.points) // POINTS)))
     if settings.specular:
