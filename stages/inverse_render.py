@@ -344,7 +344,8 @@ def check(job: Job) -> None:
         if not (image.min() >= 0.0 and image.max() <= highest):
             raise LimnError(f"{name} leaves [0, {highest:g}]: {image.min():.3f} .. {image.max():.3f}")
     if not (maps["confidence"] > 0.5).mean() > 0.01:
-        raise LimnError("less than a hundredth of the map is determined by the clip")
+        raise InputError("the clip determines less than a hundredth of the map", where=str(job.subject.folder),
+                         mend="film with more light, sharper, or with a wider turn")
     record = read_json(job.out / "solve.json")
     others = {job.out / "clips" / clip["name"]: clip for clip in record.get("clips", ())[1:]}
     for folder, clip in ({job.out: record} | others).items():

@@ -1,14 +1,18 @@
 """Signs of causes that the model cannot follow, on the egg whose light and albedo are known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from toy_capture import FRAMES, make_truth
 
+from shared.errors import InputError
+from shared.io.images import write_exr
 from shared.solve.appearance import Settings
 from shared.solve.doubts import by_orientation, doubts_about, signs_of, unlikely_colour
 from shared.solve.fit_appearance import fit_appearance
+from stages.inverse_render import check
 
 MATTE = Settings(resolutions=(6,), steps=5, specular=False, noise=(0.003, 0.01))
 
@@ -69,3 +73,14 @@ def test_an_unlikely_colour_is_one_that_neither_skin_nor_light_has():
     assert unlikely_colour(0.01 * skin, 0.15) < 1.5  # dim light is as likely as any
     assert unlikely_colour(skin * [0.3, 1.0, 2.0], 0.15) > 3.0
     assert unlikely_colour(skin * [0.3, 1.0, 2.0], 0.6) < unlikely_colour(skin * [0.3, 1.0, 2.0], 0.15)
+
+
+def test_a_clip_that_determines_nothing_is_refused(tmp_path):
+    """As of a face in the dark: the clip's fault, not a failure of ours."""
+    (tmp_path / "maps").mkdir()
+    for name in ("diffuse_albedo", "specular_intensity", "roughness", "normal", "confidence"):
+        value = 0.02 if name == "confidence" else 0.5
+        image = np.full((16, 16, 3) if name in ("diffuse_albedo", "normal") else (16, 16), value, np.float32)
+        write_exr(tmp_path / "maps" / f"{name}.exr", image, colour_space="data")
+    with pytest.raises(InputError, match="film with more light"):
+        check(SimpleNamespace(out=tmp_path, subject=SimpleNamespace(folder=tmp_path)))
