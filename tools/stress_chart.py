@@ -12,7 +12,7 @@ import numpy as np
 from shared.report.charts import COLOURS
 from tools.stress_judge import FAILED, LIMITS, RIGHT, SAID, SILENT, WARNED, allowed
 
-_COLUMNS, _WIDTH, _HEIGHT, _LEFT, _TOP = 5, 216, 168, 30, 26
+_COLUMNS, _WIDTH, _HEIGHT, _LEFT, _TOP = 5, 220, 168, 38, 26
 _PLOT = (170, 88)
 _LOWEST, _HIGHEST = -3.0, 3.0
 """Powers of two of a score over what is allowed."""

@@ -33,7 +33,7 @@ class Case:
 
     @property
     def digest(self) -> str:
-        """Of all that decides the subject, the code that renders takes included."""
+        """Of all that decides the subject."""
         content = [[[take.name, gain] for take, gain in self.mix], asdict(self)]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
 

@@ -30,7 +30,7 @@ LIMITS = {
     "albedo": Limit(3.0, 1.5, "albedo, median dE2000 after one gain per channel", "dE"),
     "albedo_p90": Limit(9.0, 1.5, "albedo, 90th percentile of the same", "dE"),
     "normals": Limit(10.0, 1.5, "normals, median", "deg"),
-    "geometry": Limit(2.0, 1.5, "distance of the surface, median", "mm"),
+    "geometry": Limit(1.0, 1.5, "distance of the surface, median", "mm"),
     "rotation": Limit(0.75, 1.5, "head rotation, mean, without the mesh", "deg"),
     "light": Limit(0.30, 1.5, "light from the front through a lobe of 25 degrees, relative error", ""),
 }
