@@ -34,10 +34,11 @@ ABLATIONS: dict[str, dict[str, object]] = {
     "matte": {"inverse_render.specular": False},
     "harmonics 4": {"inverse_render.light_model": "harmonics_4"},
     "sun and sky": {"inverse_render.light_model": "sun_sky"},
+    "model auto": {"inverse_render.model": "auto"},
 }
 """Name -> parameters; each is measured as a change of one preset."""
 QUICK = ("12 frames", "256 px", "128 directions", "2048 directions", "map 256", "mesh held", "mesh refined",
-         "no bounce", "no visibility", "matte")  # fmt: skip
+         "no bounce", "no visibility", "matte", "model auto")  # fmt: skip
 LIGHTENED = {
     "solver": "reference", "map_size": 256, "reference_pixels": 3000, "reference_light_samples": 48,
     "reference_cosine_samples": 48, "reference_lobe_samples": 16, "reference_light_resolution": 64,
