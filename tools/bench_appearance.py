@@ -259,21 +259,22 @@ class LargeClip:
 
 
 def cost_table(inputs: ClipInputs, changes: dict) -> None:
-    """Prints seconds of the light's and of the texture's part, and the peak memory so far, over sizes."""
-    print("frames  map  light_s  texture_s  peak_gb")
+    """Prints processor seconds of the light's and of the texture's part, all seconds, and the peak memory so far, over
+    sizes. Seconds of the processor grow alike on a busy machine and on an idle one."""
+    print("frames  map  light_cpu_s  texture_cpu_s  seconds  peak_gb")
     cases = [(COST_FRAMES[2], size) for size in COST_MAPS] + [(count, COST_MAPS[2]) for count in COST_FRAMES]
     for count, size in dict.fromkeys(cases):
         marks: list[tuple[str, float]] = []
 
         def progress(items, label="", total=None, marks=marks):
-            marks.append((label, time.perf_counter()))
+            marks.append((label, time.process_time()))
             return items
 
-        start = time.perf_counter()
+        start, begun = time.process_time(), time.perf_counter()
         solve_clip(LargeClip(inputs, count), settings_of({**changes, "map_size": size}), progress, lambda text: None)
-        end, first = time.perf_counter(), dict(marks)["tracing the surface"]
+        end, first, whole = time.process_time(), dict(marks)["tracing the surface"], time.perf_counter() - begun
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-        print(f"{count:6d} {size:4d} {first - start:8.1f} {end - first:10.1f} {peak:8.2f}", flush=True)
+        print(f"{count:6d} {size:4d} {first - start:12.1f} {end - first:14.1f} {whole:8.1f} {peak:8.2f}", flush=True)
 
 
 def main(arguments: list[str] | None = None) -> int:
