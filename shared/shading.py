@@ -105,20 +105,9 @@ class VertexShading:
         return self._irradiance[:, frames].mean(1, dtype=np.float32)[self.stand_in]
 
     def mean_slope(self, frames: slice | np.ndarray = slice(None)) -> np.ndarray:
-        """[V, 3] float32: by how much the mean irradiance changes per radian that the normal turns, at most.
-
-        E = n . W with the irradiance vector W (Arvo 1994), so it is the length of what of W lies in the surface.
-        """
+        """[V, 3] float32: by how much the mean irradiance changes per radian that the normal turns, at most."""
         light = self.light_along[:, frames].mean(1)
-        moments = (light[:, :, None] * self.directions[:, None] * (4.0 / len(self.directions))).astype(np.float32)
-        slope = np.empty((len(self.points), light.shape[1]), np.float32)
-        for start in range(0, len(slope), _POINTS_PER_BLOCK):
-            rows = np.arange(start, min(start + _POINTS_PER_BLOCK, len(slope)))
-            visible, normals = self.transfer.visibility(rows).astype(np.float32), self.points.normals[rows]
-            vector = (visible @ moments.reshape(len(light), -1)).reshape(len(rows), -1, 3)
-            along = np.einsum("pcx,px->pc", vector, normals)
-            slope[rows] = np.linalg.norm(vector - along[..., None] * normals[:, None], axis=2)
-        return slope[self.stand_in]
+        return irradiance_slope(self.transfer, self.points.normals, light, self.directions)[self.stand_in]
 
     def reflection(self, frame: int) -> np.ndarray:
         """S [V, 3] float32 at specular_intensity 1, between the two key frames around this one.
@@ -166,6 +155,25 @@ class VertexShading:
             )
             self._key_reflection[frame] = value
         return self._key_reflection[frame]
+
+
+def irradiance_slope(
+    transfer: Transfer, normals: np.ndarray, light: np.ndarray, directions: np.ndarray
+) -> np.ndarray:
+    """[P, C] float32: by how much E over pi of points with normals [P, 3] changes per radian that they turn, at most.
+
+    light [J, C]: along directions [J, 3]. E = n . W with the irradiance vector W (Arvo 1994), so it is the length of
+    what of W lies in the surface.
+    """
+    moments = (light[:, :, None] * directions[:, None] * (4.0 / len(directions))).astype(np.float32)
+    slope = np.empty((len(normals), light.shape[1]), np.float32)
+    for start in range(0, len(slope), _POINTS_PER_BLOCK):
+        rows = np.arange(start, min(start + _POINTS_PER_BLOCK, len(slope)))
+        visible, own = transfer.visibility(rows).astype(np.float32), normals[rows]
+        vector = (visible @ moments.reshape(len(light), -1)).reshape(len(rows), -1, 3)
+        along = np.einsum("pcx,px->pc", vector, own)
+        slope[rows] = np.linalg.norm(vector - along[..., None] * own[:, None], axis=2)
+    return slope
 
 
 def _stand_ins(vertices: np.ndarray, index: np.ndarray, blocked: np.ndarray, deep: float) -> np.ndarray:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from toy_capture import DIRECTIONS, FRAMES, make_truth, true_light
 
 from shared.envmap import cube_directions, frame_lookup
@@ -16,10 +17,11 @@ from shared.solve.fit_appearance import fit_appearance
 from shared.solve.light import LightPriors
 from shared.solve.light_models import make_light_model
 from shared.solve.light_step import LightStep
+from shared.solve.light_trust import weigh_samples
 from shared.solve.scale import scale_prior, settle_scale
 from shared.solve.texture import CORRELATED_FRAMES, Noise, NormalEquations, weigh_lights
 
-SETTINGS = Settings(resolutions=(8,), steps=7, noise=(0.003, 0.01), local_roughness=False)
+SETTINGS = Settings(resolutions=(8,), steps=12, noise=(0.003, 0.01), local_roughness=False)
 
 
 def hard_lamp(directions):
@@ -95,11 +97,42 @@ def test_lights_of_one_model_are_each_by_itself(name):
     assert cost == pytest.approx(sum(one.prior(part, LightPriors())[0] for part in own))
     assert np.allclose(gradient, np.concatenate([one.prior(part, LightPriors())[1] for part in own]))
     assert np.allclose(hessian(change)[: len(own[0])], one.prior(own[0], LightPriors())[2](change[: len(own[0])]))
+    two.shares = [0.25, 1.0]
+    shared = two.prior(params, LightPriors())
+    costs = [share * one.prior(part, LightPriors())[0] for share, part in zip(two.shares, own, strict=True)]
+    assert shared[0] == pytest.approx(sum(costs))
+    assert np.allclose(shared[1][: len(own[0])], 0.25 * gradient[: len(own[0])])
+    assert np.allclose(shared[2](change)[len(own[0]) :], hessian(change)[len(own[0]) :])
     factor = np.array([0.3, -0.2, 0.1])
     assert np.allclose(two.radiance(two.scaled(params, factor)), two.radiance(params) * np.exp(factor))
     moved = np.zeros(len(params), bool)
     moved[two.moving_rows] = True
     assert moved.sum() == 2 * (name == "sun_sky") and (name != "sun_sky" or moved[[len(own[0]) - 1, -1]].all())
+
+
+def test_samples_count_by_how_well_their_light_knows_the_point(pair):
+    """Full weight for the light whose errors a point feels least; where the lamp hardly shines the sky decides; and
+    weighing twice is no more than weighing once."""
+    capture, _, _ = pair
+    solver = AppearanceSolver(capture, replace(SETTINGS, specular=False))
+    solver.bake()
+    plain = solver.precision.clone()
+    for _ in range(8):
+        step = LightStep(solver)
+        step.take()
+        step.settle()
+        trust = weigh_samples(solver, step.irradiance, solver.model(step.irradiance, step.reflection))
+    assert max(trust) == 1.0 and min(trust) > 0.0
+    lamp, sky = solver.reliability[..., 0], solver.reliability[..., -1]
+    assert torch.allclose(torch.maximum(lamp, sky), torch.ones_like(lamp))
+    bright = step.irradiance[..., :FRAMES].mean((0, 2))
+    dim = bright < bright.quantile(0.3)
+    pull = (solver.trust * solver.precision * step.irradiance.square()).sum(0)
+    by_lamp = pull[:, :FRAMES].sum(1) / pull.sum(1)
+    assert by_lamp[dim].median() < 0.5 * by_lamp[~dim].median()
+    assert torch.allclose(solver.precision, plain * solver.reliability, rtol=1e-4)
+    assert solver.state.light_model.shares == solver.prior_shares
+    assert solver.prior_shares[0] < solver.prior_shares[1] <= 1.0
 
 
 def test_each_frame_sees_its_own_light():

@@ -140,6 +140,7 @@ class AppearanceSolver:
         self.precision = 1.0 / (sigma * sigma)
         self.fitted = torch.from_numpy(capture.fitted.astype(np.float32))
         self.light_frames = capture.frames_of_lights
+        self.reliability, self.prior_shares = torch.ones(1, 1, 1), None
         self.table = LobeTable(capture.points.normals, capture.transfer.visibility(), capture.directions)
         self.node_to_point = nearest_points(capture.nodes.points, capture.points)
         self.direct = torch.from_numpy(capture.transfer.direct.astype(np.float32))
@@ -183,6 +184,8 @@ class AppearanceSolver:
     def take_state(self, state: State) -> None:
         """Goes on from a state of these points as it is."""
         self.state, capture = state, self.capture
+        if self.prior_shares:
+            state.light_model.shares = self.prior_shares
         resolution = state.light_model.resolution
         self.frame_light = FrameLight(resolution, capture.directions, capture.world_from_head, capture.light_index)
 
@@ -273,26 +276,36 @@ class AppearanceSolver:
         weight = self.trust * self.precision
         if model is None:
             return weight * (self.limits == 0)
-        error, silent = self._errors(model)
-        return weight * (~silent) / (1.0 + error / (CAUCHY * self._spread(error, silent)))
+        error, silent = self.errors(model)
+        return weight * (~silent) / (1.0 + error / (CAUCHY * self.spread(error, silent)))
 
-    def _errors(self, model: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def errors(self, model: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Squared errors over the assumed noise's variance, and where a censored sample is satisfied; [3, P, F]."""
         error = model - self.colours
         return error.square() * self.precision, satisfied(self.limits, error)
 
-    def _spread(self, error: torch.Tensor, silent: torch.Tensor) -> float:
-        """Variance of the errors over the assumed noise's, by their median."""
-        used = (self.trust > 0).expand_as(error)
-        return max(float(error[used & ~silent].median()), 0.05) / 0.4549
+    def spread(self, error: torch.Tensor, silent: torch.Tensor, frames: slice | np.ndarray = slice(None)) -> float:
+        """Variance of the errors over the assumed noise's, by their median, in all frames or in some."""
+        used = ((self.trust > 0) & ~silent)[..., frames]
+        return max(float(error[..., frames][used].median()), 0.05) / 0.4549
+
+    def weigh(self, reliability: torch.Tensor) -> None:
+        """How much samples of several lights count against each other, [3, P, F]: 1 in full. A light's prior steps back
+        as its samples do."""
+        self.precision = self.precision * (reliability / self.reliability)
+        self.reliability = reliability
+        used = self.trust.expand_as(reliability)
+        self.prior_shares = [float((used * reliability)[..., own].sum() / used[..., own].sum())
+                             for own in self.light_frames]
+        self.state.light_model.shares = self.prior_shares
 
     def loss(self, model: torch.Tensor, spread: float | None = None) -> tuple[float, float]:
         """Mean Cauchy loss of the fitted samples, of errors of this spread (None: their own), and that spread.
 
         What the steps lower: unlike a mean square it does not rise when many samples fit better and a few worse.
         """
-        error, silent = self._errors(model)
-        spread = self._spread(error, silent) if spread is None else spread
+        error, silent = self.errors(model)
+        spread = self.spread(error, silent) if spread is None else spread
         weight = self.trust * self.fitted
         loss = torch.log1p(error * (~silent) / (CAUCHY * spread))
         return float((weight * loss).sum() / (3.0 * weight.sum())), spread
@@ -348,17 +361,20 @@ class AppearanceSolver:
         self.misfit = max(1.0, squared)
 
     def residuals(self, model: torch.Tensor) -> tuple[float, float]:
-        """Root mean square residual (linear, trust-weighted, censored) on fitted and on held-out frames."""
-        squared = (model - self.colours).square() * (~self._errors(model)[1])
+        """Root mean square residual (linear, trust-weighted, censored) on fitted and on held-out frames, of the mean
+        over the lights."""
+        squared = (model - self.colours).square() * (~self.errors(model)[1])
         result = []
         for chosen in (self.fitted, 1.0 - self.fitted):
             weight = self.trust * chosen
-            result.append(float(((weight * squared).sum() / (3.0 * weight.sum()).clamp_min(1e-9)).sqrt()))
+            means = [(weight * squared)[..., own].sum() / (3.0 * weight[..., own].sum()).clamp_min(1e-9)
+                     for own in self.light_frames]
+            result.append(float((sum(means) / len(means)).sqrt()))
         return result[0], result[1]
 
     def frame_errors(self, model: torch.Tensor) -> np.ndarray:
         """[F] mean absolute residual of each frame, weighted and censored likewise: unlike a mean square not ruled by
         the few samples that a wrong shape or a shadow's edge spoils."""
-        error = (model - self.colours).abs() * (~self._errors(model)[1])
+        error = (model - self.colours).abs() * (~self.errors(model)[1])
         total = (3.0 * self.trust.sum((0, 1))).clamp_min(1e-9)
         return ((self.trust * error).sum((0, 1)) / total).double().numpy()

@@ -10,6 +10,7 @@ import torch
 
 from shared.solve.appearance import AppearanceSolver, Capture, Settings, State
 from shared.solve.light_step import LightStep
+from shared.solve.light_trust import weigh_samples
 from shared.solve.local_roughness import ROUGHNESS_RANGE, GlossEquations, local_roughness
 
 SHAPING_STEPS = 3
@@ -34,7 +35,8 @@ class Solution:
     """The best State by held-out residual; iterations: one record per step; fitted and held_out: its residuals; gloss:
     where roughness varies over the skin, how, and gloss_record what the held-out frames said to that; trusted: whether
     highlights took part to the end; frame_errors [F]: each frame's mean absolute residual; local_specular: where the
-    specular intensity varies with the face's segments, how."""
+    specular intensity varies with the face's segments, how; light_trust: of several lights, how much samples of each
+    count against those of the light that the model follows best."""
 
     state: State
     iterations: tuple[dict, ...]
@@ -45,6 +47,7 @@ class Solution:
     trusted: bool = True
     frame_errors: np.ndarray | None = None
     local_specular: GlossEquations | None = None
+    light_trust: tuple[float, ...] = ()
 
 
 def fit_appearance(
@@ -104,7 +107,8 @@ def fit_appearance(
             last = judged
     _, record, state, by_frame = best
     errors = record["fitted"], record["held_out"]
-    return Solution(state, tuple(records), *errors, trusted=trusts, frame_errors=by_frame)
+    light_trust = tuple(record.get("light_trust", ()))
+    return Solution(state, tuple(records), *errors, trusted=trusts, frame_errors=by_frame, light_trust=light_trust)
 
 
 def with_local_roughness(capture: Capture, settings: Settings, solution: Solution) -> Solution:
@@ -138,7 +142,10 @@ def _step(
     rise = solver.loss(model, spread)[0] / before
     solver.measure_misfit(model, step.weight)
     fitted, held_out = solver.residuals(model)
-    return {
+    several = {}
+    if len(solver.light_frames) > 1:
+        several = {"light_trust": weigh_samples(solver, step.irradiance, model)}
+    return several | {
         "fitted": fitted,
         "held_out": held_out,
         "cost": step.before,

@@ -150,7 +150,8 @@ def solve_clip(
     surface = TexelSurface(inputs.mesh, settings.map_size)
     clip = Clip(inputs.picture, inputs.camera_from_head, inputs.intrinsics, fitted, inputs.light_index)
     typical = np.median(solution.state.albedo, axis=0)
-    texture = TexturePass(surface, viewer, shading, clip, specular_at(surface, solution), typical, progress=progress)
+    known = specular_at(surface, solution), typical
+    texture = TexturePass(surface, viewer, shading, clip, *known, light_trust=solution.light_trust, progress=progress)
     widths = settings.map_size * np.array(settings.specular_widths if settings.appearance.specular else (np.inf,))
     material, texture_record = texture.run(widths)
     gloss = solution.gloss

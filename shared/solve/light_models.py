@@ -17,7 +17,7 @@ spatially-varying reflectance, SIGGRAPH Asia 2009 (spherical Gaussians).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.special import sph_harm_y
@@ -180,11 +180,12 @@ class LampLight:
 class SeveralLights:
     """Lights of one model, each by itself: their parameters, and their cubemaps, one below the other.
 
-    All raise together: what they are to each other is for the samples to say.
+    All raise together: what they are to each other is for the samples to say. shares [L]: weight of each one's prior.
     """
 
     def __init__(self, model: LogLight | LampLight, count: int):
         self.model, self.count, self.resolution = model, count, model.resolution
+        self.shares = [1.0] * count
         self.unit = np.tile(model.unit, (count, 1))
         own = np.arange(len(model.unit))
         moving = own[model.moving_rows]
@@ -211,15 +212,20 @@ class SeveralLights:
         return params + self.unit * log_factor
 
     def prior(self, params: np.ndarray, priors: LightPriors) -> tuple[float, np.ndarray, Callable]:
-        """Sum of the costs, gradient [L M, 3] and Hessian product of the regularisers."""
-        costs, gradients, products = zip(*(self.model.prior(own, priors) for own in np.split(params, self.count)),
-                                         strict=True)
+        """Sum of the costs, gradient [L M, 3] and Hessian product of the regularisers, of each light times its share.
+        """
+        each = (self.model.prior(own, priors) for own in np.split(params, self.count))
+        costs, gradients, products = zip(*each, strict=True)
 
         def product(change: np.ndarray) -> np.ndarray:
             parts = zip(products, np.split(change, self.count), strict=True)
-            return np.concatenate([of_one(part) for of_one, part in parts])
+            return self._weighted([of_one(part) for of_one, part in parts])
 
-        return sum(costs), np.concatenate(gradients), product
+        cost = sum(share * own for share, own in zip(self.shares, costs, strict=True))
+        return cost, self._weighted(gradients), product
+
+    def _weighted(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        return np.concatenate([share * part for share, part in zip(self.shares, parts, strict=True)])
 
     def fit(self, radiance: np.ndarray) -> np.ndarray:
         """Parameters whose lights come closest to cubemaps of any resolution, one below the other -> [L M, 3]."""

@@ -65,7 +65,8 @@ class ShapeSettings:
 @dataclass(frozen=True)
 class Reflectance:
     """What the shape is solved under: light [6 n^2, 3], specular intensity, roughness and how it varies; nodes with
-    their albedo [K, 3]: where light bounced when it was solved."""
+    their albedo [K, 3]: where light bounced when it was solved; light_trust: of several lights, which lie one below the
+    other, how much samples of each count."""
 
     light: np.ndarray
     specular: float
@@ -73,13 +74,14 @@ class Reflectance:
     nodes: Nodes
     node_albedo: np.ndarray
     gloss: GlossEquations | None = None
+    light_trust: tuple[float, ...] = ()
 
     @staticmethod
     def of(solution: Solution, scenery: Scenery) -> Reflectance:
         """That of a solved appearance."""
         state = solution.state
         known = state.light, state.specular, state.roughness, scenery.nodes, state.node_albedo
-        return Reflectance(*known, solution.gloss)
+        return Reflectance(*known, solution.gloss, solution.light_trust)
 
 
 @dataclass(frozen=True)
@@ -163,6 +165,8 @@ class ShapeSolver:
         clip, settings, index = self.clip, self.settings, traced.index
         points = mesh_points(mesh, index)
         samples = gather_surface(points.positions, traced.views, clip.camera_from_head, clip.intrinsics)
+        if self.reflectance.light_trust:
+            samples.weight[:] *= np.array(self.reflectance.light_trust, np.float32)[clip.light_index]
         transfer = traced.turned_to(points.normals)
         seen = (samples.weight[:, clip.fitted] > 0).sum(1) >= min(MINIMUM_FRAMES, int(clip.fitted.sum()))
         rows = np.nonzero(seen & (transfer.blocked < DEEP))[0]

@@ -105,6 +105,12 @@ class NormalEquations:
     def _bounded_albedo(self, typical_albedo: np.ndarray) -> np.ndarray:
         return np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)
 
+    def scale(self, trust: float) -> None:
+        """All weights times that."""
+        if trust != 1.0:
+            self.sums *= trust
+            self.clipped_ee *= trust
+
     def trusted_share(self, typical_albedo: np.ndarray, systematic: np.ndarray) -> np.ndarray:
         """[T, 3]: how much of their weight errors that all frames share leave to the equations, among those of other
         lights."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,7 +48,8 @@ class Clip:
 class TexturePass:
     """Per-texel albedo and specular intensity under a fixed light, roughness and geometry.
 
-    specular: the clip's one intensity, the prior's mean; typical_albedo [3]; sigma: how far a texel may leave it.
+    specular: the clip's one intensity, the prior's mean; typical_albedo [3]; sigma: how far a texel may leave it;
+    light_trust: how much samples of each light count, by how well the model follows it; empty: all alike.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class TexturePass:
         typical_albedo: np.ndarray,
         sigma: float = 0.25,
         noise: Noise | None = None,
+        light_trust: Sequence[float] = (),
         progress: Callable = lambda items, label: items,
     ):
         self.surface, self.viewer, self.shading, self.clip = surface, viewer, shading, clip
@@ -68,7 +70,8 @@ class TexturePass:
         self.intrinsics = np.broadcast_to(clip.intrinsics, (len(clip.fitted), 3, 3))
         self.light_index = np.zeros(len(clip.fitted), int) if clip.light_index is None else clip.light_index
         lights = frames_of_lights(self.light_index, len(clip.fitted))
-        self.systematic = [self._systematic(frames) for frames in lights]
+        self.light_trust = tuple(light_trust) or (1.0,) * len(lights)
+        self.systematic = [self._systematic(own) / trust for own, trust in zip(lights, self.light_trust, strict=True)]
         self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), progress
 
     def _systematic(self, frames: np.ndarray) -> np.ndarray:
@@ -105,6 +108,8 @@ class TexturePass:
                 model = _model(material, samples, irradiance, reflection)
                 robust = robust_weight(model, samples, self.noise, material.information[samples.rows])
             parts[self.light_index[f]].add(samples, irradiance, reflection, robust)
+        for part, trust in zip(parts, self.light_trust, strict=True):
+            part.scale(trust)
         return weigh_lights(parts, self.systematic, self.typical_albedo)
 
     def frame(self, f: int) -> tuple[TexelSamples, np.ndarray, np.ndarray]:
