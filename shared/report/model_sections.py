@@ -33,7 +33,7 @@ def climbed_table(ladder: Sequence[Mapping]) -> str:
     head = ("part", "rung", "held-out error", "fell by", "standard error", "climbed", "seconds")
     keys = ("part", "rung", "held_out", "fall", "standard_error", "climbed", "seconds")
     errors = ("held_out", "fall", "standard_error")
-    rows = [[f"{rung[key]:.5f}" if key in errors and rung[key] is not None else number(rung[key]).replace("_", " ")
+    rows = [[f"{rung[key]:.6f}" if key in errors and rung[key] is not None else number(rung[key]).replace("_", " ")
              for key in keys] for rung in ladder]
     note = ('<p class="note">The ladder, climbed on few points and frames: a rung stays where the error on frames that '
             "were held out falls by more than its standard error. What it led to was then solved in full:</p>")

@@ -146,9 +146,9 @@ class _Climber:
 
     def _report(self, record: dict) -> None:
         self.rungs.append(record)
-        fall = "" if record["fall"] is None else f", {-record['fall']:+.5f} +- {record['standard_error']:.5f}"
+        fall = "" if record["fall"] is None else f", {-record['fall']:+.6f} +- {record['standard_error']:.6f}"
         said = "climbed" if record["climbed"] else "not climbed"
-        text = f"{record['part']} {record['rung']}: {record['held_out']:.5f} held out{fall}"
+        text = f"{record['part']} {record['rung']}: {record['held_out']:.6f} held out{fall}"
         self.note(f"ladder: {text}; {said} ({record['seconds']:.1f} s)")
 
     def climbed(self) -> Climbed:
