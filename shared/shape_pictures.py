@@ -35,7 +35,8 @@ def shape_sheet(start: Mesh, mesh: Mesh, face: np.ndarray | None, size: int = 40
     names = ("start", "refined", "normals", f"refined - start: red {LARGEST_DIFFERENCE_MM:g} mm out, blue in")
     for row, name in enumerate(names):
         place = 8, row * size + 18
-        cv2.putText(sheet, name, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
+        for ink, width in ((3 * (BACKDROP,), 4), (INK, 1)):  # dark around it, since skin may lie behind
+            cv2.putText(sheet, name, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, ink, width, cv2.LINE_AA)
     return sheet
 
 

@@ -40,6 +40,10 @@ class TexelSurface:
     def __len__(self) -> int:
         return len(self.pixel)
 
+    def typical_texel_mm(self) -> float:
+        """Median edge of a texel on the surface, mm."""
+        return float(np.median(self._texel_mm))
+
     def interpolate(self, values: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Vertex values [V, C] at some texels -> [n, C] float32."""
         table = torch.from_numpy(np.ascontiguousarray(values, np.float32))

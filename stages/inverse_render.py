@@ -33,7 +33,7 @@ LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 STAGE = Stage(
     name="inverse_render",
-    version=7,
+    version=8,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -94,6 +94,7 @@ STAGE = Stage(
                   "surface moves together.", "", 0.0, 10000.0),
         Parameter("shape_spread", float, 8.0, "Expected distance of the tracked mesh from the truth where it is wrong "
                   "as a whole.", "mm", 0.01, 100.0),
+        Parameter("normal_map", bool, True, "Solve relief finer than the mesh as a normal map; else it is flat."),
         Parameter("render_count", int, 8, "Frames to re-render, spread evenly.", "frames", 1, 2000),
         Parameter("mesh", str, "", "Mesh (.npz or .obj) to use instead of the tracked one; empty: tracked.",
                   file=True),
@@ -133,7 +134,7 @@ SPECULAR_SPREAD = 0.25
 """Standard deviation of the logarithm of people's mean specular intensity about the expected one."""
 FAR_PX = 1.5
 """Median distance of a clip's skin from where the shared mesh shows it, from which on the clips do not go together."""
-FLAT_NORMALS = "flat: this version solves no fine normals"
+FLAT_NORMALS = "flat: fine normals were not solved"
 
 
 def read_settings(job: Job, checkpoint=None):
@@ -180,6 +181,7 @@ def read_settings(job: Job, checkpoint=None):
         hold_out_every=params.hold_out_every,
         shape=shape if params.shape else None,
         fit_frames=params.fit_frames,
+        normal_map=params.normal_map,
         reference=read_reference(job, checkpoint) if params.solver == "reference" else None,
         ladder=read_forced(params.forced) if params.model == "auto" else None,
     )
@@ -229,7 +231,7 @@ def write_maps(job: Job, result) -> None:
     (job.out / "maps").mkdir()
     for name, image in result.maps.items():
         colour_space = "lin_rec709_scene" if name == "diffuse_albedo" else "data"
-        attributes = {"content": FLAT_NORMALS} if name == "normal" else {}
+        attributes = {"content": FLAT_NORMALS} if name == "normal" and not result.record.get("relief") else {}
         write_exr(job.out / "maps" / f"{name}.exr", image, colour_space=colour_space, attributes=attributes)
 
 

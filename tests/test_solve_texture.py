@@ -8,7 +8,7 @@ from shared.gather import SurfaceViewer, prepare_picture
 from shared.geometry import rigid, rotation_from_vector
 from shared.mesh import interpolate
 from shared.raycast import RayScene, camera_hits
-from shared.solve.inverse import make_maps
+from shared.solve.maps import make_maps
 from shared.solve.texture import Noise, NormalEquations, pooled_specular, robust_weight
 from shared.solve.texture_pass import Clip, TexturePass
 from shared.texels import TexelSamples, TexelSurface, smooth_field

@@ -30,10 +30,12 @@ from shared.solve.doubts import doubts_about, signs_of
 from shared.solve.fit_appearance import Solution, fit_appearance, with_local_roughness
 from shared.solve.frame_choice import covering_frames
 from shared.solve.light_models import SeveralLights
+from shared.solve.maps import make_maps
+from shared.solve.normal_map import NormalPass, resolved_texels
 from shared.solve.reference_settings import ReferenceSettings
 from shared.solve.reshape import faces_of, meet_outline, reshape
 from shared.solve.shape import Reflectance, ShapeSettings
-from shared.solve.texture import PRIOR_SPREAD, TexelMaterial
+from shared.solve.texture import TexelMaterial
 from shared.solve.texture_pass import Clip, TexturePass
 from shared.texels import TexelSurface
 from shared.transfer import mesh_points
@@ -84,6 +86,7 @@ class InverseSettings:
     shape: ShapeSettings | None = field(default_factory=ShapeSettings)
     fit_frames: int = 0
     reference: ReferenceSettings | None = None
+    normal_map: bool = True
     ladder: frozenset[str] | None = None
     specular_widths: tuple[float, ...] = (np.inf, 1 / 16, 1 / 64)
 
@@ -156,10 +159,15 @@ def solve_clip(
     material, texture_record = texture.run(widths)
     gloss = solution.gloss
     roughness = solution.state.roughness if gloss is None else gloss.roughness(inputs.mesh.vertices)
-    maps = make_maps(surface, material, roughness)
+    turn, relief = None, {}
+    if settings.normal_map:
+        fine = NormalPass(surface, viewer, shading, clip, material, progress)
+        turn, relief = fine.run(resolved_texels(surface, clip))
+        note(f"fine normals: {relief}")
+    maps = make_maps(surface, material, roughness, turn)
     warnings = [*[warning] * bool(warning), *doubt_scale(chart, typical), *doubts_about(signs)]
     shape_record = {**lit.shape_record, "outline": outline}
-    record = {"texture": texture_record, "shape": shape_record, "signs": signs, "warnings": warnings}
+    record = {"texture": texture_record, "shape": shape_record, "relief": relief, "signs": signs, "warnings": warnings}
     record |= {"albedo_scale": describe_scale(chart, typical), "rungs": lit.rungs}
     return InverseResult(solution, material, maps, shading, viewer, fitted, record)
 
@@ -316,21 +324,6 @@ def specular_at(surface: TexelSurface, solution: Solution) -> float | np.ndarray
     return np.clip(solution.local_specular.specular_at(surface.interpolate(surface.mesh.vertices)), 0.0, 2.0)
 
 
-def make_maps(surface: TexelSurface, material: TexelMaterial, roughness: float | np.ndarray) -> dict[str, np.ndarray]:
-    """UV-space images with filled gutters; roughness: one, or each vertex's [V]; confidence is the share of the prior's
-    variance that the clip removed."""
-    confidence = PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + 1.0 / np.maximum(material.information, 1e-9))
-    size = (surface.size, surface.size)
-    at_vertices = np.broadcast_to(np.asarray(roughness), len(surface.mesh.vertices))[:, None]
-    return {
-        "diffuse_albedo": surface.dilated(surface.to_image(material.albedo.astype(np.float32))),
-        "specular_intensity": surface.dilated(surface.to_image(material.specular.astype(np.float32))),
-        "roughness": surface.dilated(surface.to_image(surface.interpolate(at_vertices)[:, 0])),
-        "normal": np.broadcast_to(np.array([0.5, 0.5, 1.0], np.float32), size + (3,)).copy(),
-        "confidence": surface.to_image(confidence.astype(np.float32)),
-    }
-
-
 def summarise(inputs: InverseInputs, result: InverseResult) -> dict:
     """What solve.json says, but for which frames were rendered and held out."""
     solution, state = result.solution, result.solution.state
@@ -349,7 +342,7 @@ def summarise(inputs: InverseInputs, result: InverseResult) -> dict:
             "held_out": solution.held_out,
             "texture_held_out": result.record["texture"]["held_out"],
         },
-        **{key: result.record[key] for key in ("shape", "signs") if key in result.record},
+        **{key: result.record[key] for key in ("shape", "relief", "signs") if key in result.record},
         **({"ladder": [dict(rung) for rung in result.record["rungs"]]} if result.record.get("rungs") else {}),
         "iterations": list(solution.iterations),
         "albedo_scale": result.record["albedo_scale"],

@@ -35,7 +35,7 @@ from shared.solve.shape_step import (
 )
 from shared.solve.shape_terms import Reflections, shading_terms
 from shared.solve.silhouette import RimSettings
-from shared.transfer import Nodes, Transfer, mesh_points, nearest_points
+from shared.transfer import Nodes, Points, Transfer, mesh_points, nearest_points
 
 SHAPED = ("forehead", "brows", "lids", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "lips", "chin", "jaw")
 """Segments whose samples shape the surface. Ears, neck and scalp follow them; what HELD names stays the model's."""
@@ -111,10 +111,11 @@ class Surface:
 @dataclass(frozen=True)
 class Traced:
     """What is looked up once per level, since steps move the surface by far less than what it sees is away: the
-    transfer of vertices index [P], how the frames see them, and what they reflect (None: nothing)."""
+    points of vertices index [P] and their transfer, how the frames see them, and what they reflect (None: nothing)."""
 
     scenery: Scenery
     index: np.ndarray
+    points: Points
     transfer: Transfer
     views: list[SurfaceView]
     reflections: Reflections | None
@@ -142,22 +143,27 @@ class ShapeSolver:
         self.clip, self.reflectance = clip, reflectance
         self.appearance, self.sizes, self.settings, self.note = appearance, sizes, settings, note
 
-    def trace(self, mesh: Mesh, shaped: np.ndarray) -> Traced:
-        """Looks at the shaped faces' vertices that some frame faces."""
+    def trace(self, mesh: Mesh, shaped: np.ndarray, before: Traced | None = None) -> Traced:
+        """Looks at the shaped faces' vertices that some frame faces. before: of a coarser level, whose nearest point
+        tells what each sees."""
         clip = self.clip
         viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
-        scenery = set_scenery(viewer, self.sizes, self.appearance.visibility)
         wanted = np.zeros(len(mesh.vertices), bool)
         wanted[mesh.faces[shaped]] = True
         index = np.nonzero(wanted & face_front(viewer, clip.camera_from_head, 0.2))[0]
-        transfer = scenery.trace(mesh_points(mesh, index))
+        points = mesh_points(mesh, index)
+        if before is None:
+            scenery = set_scenery(viewer, self.sizes, self.appearance.visibility)
+            transfer = scenery.trace(points)
+        else:
+            scenery, transfer = before.scenery, before.transfer.take(nearest_points(points, before.points))
         blur = BLUR_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
         pictures = read_ahead(map(clip.picture, self.progress(range(len(clip.camera_from_head)), "shape, sampling")))
         views = look_at_surface(viewer, index, pictures, clip.camera_from_head, clip.intrinsics, blur)
-        traced = Traced(scenery, index, transfer, views, None)
+        traced = Traced(scenery, index, points, transfer, views, None)
         if not self.appearance.specular or len(index) < FEWEST_POINTS:
             return traced
-        shading = self._shade(mesh, traced, mesh_points(mesh, index), transfer)
+        shading = self._shade(mesh, traced, points, traced.turned_to(points.normals))
         return replace(traced, reflections=Reflections(shading, np.arange(len(index))))
 
     def examine(self, mesh: Mesh, shaped: np.ndarray, traced: Traced) -> Surface | None:
@@ -230,7 +236,7 @@ class ShapeSolver:
     ) -> tuple[Mesh, Mesh]:
         """The mesh subdivided as the settings say, as it was and refined. shaped, held [faces] bool; begun: the mesh,
         or a subdivision of it, as it was refined before: goes on from the next one."""
-        start, mesh = mesh, mesh if begun is None else begun
+        start, mesh, traced = mesh, mesh if begun is None else begun, None
         for level in range(self.settings.subdivisions + 1):
             if level > 0:
                 shaped, held, start = np.repeat(shaped, 4), np.repeat(held, 4), subdivide(start)
@@ -238,11 +244,11 @@ class ShapeSolver:
                 continue
             if len(mesh.faces) < len(start.faces):
                 mesh = subdivide(mesh)
-            mesh = self._refine_level(mesh, start.vertices, shaped, held, level)
+            traced = self.trace(mesh, shaped, traced)
+            mesh = self._refine_level(mesh, start.vertices, shaped, held, level, traced)
         return start, mesh
 
-    def _refine_level(self, mesh, start, shaped, held, level) -> Mesh:
-        traced = self.trace(mesh, shaped)
+    def _refine_level(self, mesh, start, shaped, held, level, traced: Traced) -> Mesh:
         surface = self.examine(mesh, shaped, traced)
         if surface is None:
             self.note(f"shape level {level}: too little of the face is seen, the mesh stays")

@@ -1,0 +1,197 @@
+"""Relief finer than the mesh, per texel, as a tangent-space normal map.
+
+With light, reflectance and mesh given, a texel's residual changes by the turn (k1, k2) of its normal towards the two
+directions of the texture, as in shape_equations; its albedo is eliminated per channel. What a vertex's neighbourhood
+shares in a frame is laid to light, pose and mesh: only finer relief counts. Equations are pooled over what the pictures
+resolve, so that no texel claims more, and the turn has a prior of none. Held-out frames say how wide the prior is and
+what share of the relief is true.
+
+Reference: Horn, Obtaining shape from shading information, 1975; tangents as of Mikkelsen, Simulation of wrinkled
+surfaces revisited, 2008 (MikkTSpace).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+
+from shared.gather import SurfaceViewer
+from shared.mesh import Mesh, normalised, vertex_adjacency
+from shared.shading import VertexShading
+from shared.solve.capture import spread_frames
+from shared.solve.shape_terms import IrradianceVectors, Reflections
+from shared.solve.texture import CORRELATED_FRAMES, Noise, TexelMaterial, robust_weight
+from shared.solve.texture_pass import Clip
+from shared.texels import TexelSurface
+
+FRAMES = 32
+RESOLVED_PX, WIDTH_OF_DEVIATION = 2.0, 2.355
+"""Lenses and codecs resolve no single pixel. A Gaussian's width at half height is 2.355 standard deviations."""
+LEAST_POOL = 0.5
+PRIORS = (0.05, 0.1, 0.2, 0.4)
+"""Standard deviations in radians of what the mesh leaves out of the skin's normals; held-out frames choose."""
+LARGEST_TURN = 1.0
+"""Tangent of the largest angle between the map's normal and the mesh's."""
+
+
+def uv_tangents(mesh: Mesh, normals: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+    """[n, 2, 3] float32 at places on faces [n] with corner weights [n, 3]: unit directions of growing u and v.
+
+    normals [n, 3] unit. The faces' directions of u are averaged at each texture vertex and made orthogonal to the
+    normal at the place; the second direction is normal x first, turned to where v grows.
+    """
+    corners, uv = mesh.vertices[mesh.faces], mesh.uvs[mesh.face_uvs]
+    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    d1, d2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    sign = np.where(d1[:, 0] * d2[:, 1] - d2[:, 0] * d1[:, 1] >= 0, 1.0, -1.0)[:, None]
+    along_u = normalised(sign * (e1 * d2[:, 1:] - e2 * d1[:, 1:]))
+    total = np.zeros((len(mesh.uvs), 3))
+    for k in range(3):
+        np.add.at(total, mesh.face_uvs[:, k], along_u)
+    first = np.einsum("nk,nkx->nx", bary, total[mesh.face_uvs[face]])
+    first = normalised(first - (first * normals).sum(1, keepdims=True) * normals)
+    return np.stack([first, np.cross(normals, first) * sign[face]], axis=1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class ReliefEquations:
+    """Per texel, albedo eliminated: hessian [T, 3] (k1 k1, k1 k2, k2 k2) and gradient [T, 2] of the cost of a turn."""
+
+    hessian: np.ndarray
+    gradient: np.ndarray
+
+    def confirmed(self, turn: np.ndarray) -> tuple[float, float]:
+        """What share of the turns [T, 2] of all texels, 0 to 1, lowers the cost most, and by how much that is."""
+        (a11, a12, a22), (k1, k2) = self.hessian.T.astype(np.float64), turn.T
+        curvature = float((a11 * k1**2 + 2.0 * a12 * k1 * k2 + a22 * k2**2).sum())
+        slope = float((self.gradient * turn).sum())
+        share = float(np.clip(-slope / max(curvature, 1e-9), 0.0, 1.0))
+        return share, -share * (slope + 0.5 * share * curvature)
+
+
+class NormalPass:
+    """Per-texel normals under a fixed light, reflectance and mesh. material: the texels', from the texture pass."""
+
+    def __init__(
+        self,
+        surface: TexelSurface,
+        viewer: SurfaceViewer,
+        shading: VertexShading,
+        clip: Clip,
+        material: TexelMaterial,
+        progress: Callable = lambda items, label: items,
+        noise: Noise | None = None,
+    ):
+        self.surface, self.viewer, self.shading, self.clip = surface, viewer, shading, clip
+        self.material, self.progress, self.noise = material, progress, noise or Noise()
+        self.intrinsics = np.broadcast_to(clip.intrinsics, (len(clip.fitted), 3, 3))
+        self.vectors = IrradianceVectors(shading.transfer.visibility(), shading.directions, shading.light_along)
+        self.reflections = Reflections(shading, np.arange(len(shading.points)))
+        normals = normalised(surface.interpolate(viewer.normals))
+        self.tangents = uv_tangents(surface.mesh, normals, surface.face, surface.bary)
+        self.corner = surface.mesh.faces[surface.face, surface.bary.argmax(1)]
+        adjacency = vertex_adjacency(surface.mesh.faces, len(surface.mesh.vertices))
+        self.around = adjacency + 1.0 * (adjacency @ adjacency > 0)
+
+    def run(self, pool: float) -> tuple[np.ndarray, dict]:
+        """Turns [T, 2], tangents of angles towards growing u and v, and a record. pool: standard width over which
+        texels count together, in texels."""
+        fitted, held_out = (np.nonzero(chosen)[0] for chosen in (self.clip.fitted, ~self.clip.fitted))
+        equations = self.accumulate(fitted[spread_frames(len(fitted), FRAMES)])
+        unseen = self.accumulate(held_out[spread_frames(len(held_out), FRAMES // 4)])
+        turns = [self.solve(equations, pool, prior) for prior in PRIORS]
+        shares, gains = zip(*(unseen.confirmed(turn) for turn in turns), strict=True)
+        best = int(np.argmax(gains))
+        turn = turns[best] * np.float32(shares[best])
+        angle = np.degrees(np.arctan(np.linalg.norm(turn[self.material.information > 1.0], axis=1)))
+        typical, large = np.percentile(angle, [50, 95]) if len(angle) else (0.0, 0.0)
+        record = {"prior_radians": PRIORS[best], "confirmed_share": shares[best], "pooled_texels": pool}
+        return turn, record | {"median_deg": float(typical), "p95_deg": float(large)}
+
+    def accumulate(self, frames: np.ndarray) -> ReliefEquations:
+        """The equations of some frames."""
+        count = len(self.surface)
+        per_channel = np.zeros((count, 12), np.float32)  # EE, E d1, E d2, E r, three channels each
+        together = np.zeros((count, 5), np.float32)  # d1 d1, d1 d2, d2 d2, d1 r, d2 r
+        for f in self.progress(frames, "fine normals"):
+            rows, e, d, r, w = self.frame(int(f))
+            share = [w * e * e, w * e * d[..., 0], w * e * d[..., 1], w * e * r]
+            products = [d[..., 0] ** 2, d[..., 0] * d[..., 1], d[..., 1] ** 2, d[..., 0] * r, d[..., 1] * r]
+            at = torch.from_numpy(rows)
+            for sums, parts in (
+                (per_channel, np.concatenate(share, axis=1)),
+                (together, np.stack([(w * product).sum(1) for product in products], axis=1)),
+            ):
+                torch.from_numpy(sums).index_add_(0, at, torch.from_numpy(parts.astype(np.float32)))
+        ee, e1, e2, er = (per_channel[:, 3 * k : 3 * k + 3] for k in range(4))
+        ee = np.maximum(ee, 1e-6)
+        hessian = together[:, :3] - np.stack([(e1 * e1 / ee).sum(1), (e1 * e2 / ee).sum(1), (e2 * e2 / ee).sum(1)], 1)
+        gradient = together[:, 3:] - np.stack([(e1 * er / ee).sum(1), (e2 * er / ee).sum(1)], axis=1)
+        return ReliefEquations(hessian, gradient)
+
+    def frame(self, f: int) -> tuple[np.ndarray, ...]:
+        """Rows [n], E [n, 3], derivatives by the turn [n, 3, 2], residuals [n, 3] and weights [n, 3] of one frame."""
+        clip, shading, material = self.clip, self.shading, self.material
+        pose, picture, lens = clip.camera_from_head[f], clip.picture(f), self.intrinsics[f]
+        view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
+        slope = self.vectors.frames(slice(f, f + 1))[:, 0]
+        gloss, gloss_slope = self.reflections.at(f, shading.points.normals)
+        of_points = np.concatenate([gloss, slope.reshape(-1, 9), gloss_slope.reshape(-1, 9)], axis=1)
+        values = np.concatenate([shading.irradiance(f), of_points[shading.stand_in]], axis=1)
+        samples, found = self.surface.samples(view, picture, lens, values)
+        rows = samples.rows
+        e, s = found[:, :3], found[:, 3:6]
+        intensity, albedo = material.specular[rows, None], material.albedo[rows]
+        model = albedo * e + intensity * s
+        turning = albedo[..., None] * found[:, 6:15].reshape(-1, 3, 3)
+        turning += intensity[..., None] * found[:, 15:].reshape(-1, 3, 3)
+        derivative = np.einsum("ncx,nkx->nck", turning, self.tangents[rows])
+        robust = robust_weight(model, samples, self.noise, material.information[rows])
+        weight = samples.weight[:, None] * self.noise.precision(samples.colours) * robust
+        return rows, e, derivative, self._fine(model - samples.colours, model, weight, rows), weight
+
+    def _fine(self, error: np.ndarray, model: np.ndarray, weight: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """The residuals [n, 3] without what the vertices' neighbourhoods share, relative to the model."""
+        scale, corner, count = np.maximum(model, 1e-3), self.corner[rows], len(self.surface.mesh.vertices)
+        total, mean = np.zeros((count, 3)), np.zeros((count, 3))
+        for c in range(3):
+            trust = weight[:, c] * scale[:, c] ** 2
+            total[:, c] = np.bincount(corner, trust, count)
+            mean[:, c] = np.bincount(corner, trust * error[:, c] / scale[:, c], count)
+        mean = (self.around @ mean) / np.maximum(self.around @ total, 1e-9)
+        return error - scale * self.surface.interpolate(mean, rows)
+
+    def solve(self, equations: ReliefEquations, pool: float, prior: float) -> np.ndarray:
+        """The most likely turns [T, 2] float32 under a standard deviation of prior radians."""
+        pooled = [self._pooled(x, pool) / CORRELATED_FRAMES for x in (*equations.hessian.T, *equations.gradient.T)]
+        a11, a12, a22, b1, b2 = pooled
+        p11, p22 = a11 + prior**-2, a22 + prior**-2
+        determinant = p11 * p22 - a12 * a12
+        turn = np.stack([a12 * b2 - p22 * b1, a12 * b1 - p11 * b2], axis=1) / determinant[:, None]
+        length = np.linalg.norm(turn, axis=1, keepdims=True)
+        turn *= np.minimum(1.0, LARGEST_TURN / np.maximum(length, 1e-9))
+        return turn.astype(np.float32)
+
+    def _pooled(self, values: np.ndarray, pool: float) -> np.ndarray:
+        image = gaussian_filter(self.surface.to_image(values), pool, mode="constant")
+        return image.ravel()[self.surface.pixel]
+
+
+def resolved_texels(surface: TexelSurface, clip: Clip) -> float:
+    """Standard width in texels of what the pictures resolve of the texture where it is largest in them."""
+    px_per_mm = np.max(clip.intrinsics[..., 0, 0]) / np.median(clip.camera_from_head[:, 2, 3])
+    return max(RESOLVED_PX / WIDTH_OF_DEVIATION / float(px_per_mm * surface.typical_texel_mm()), LEAST_POOL)
+
+
+def normal_image(surface: TexelSurface, turn: np.ndarray | None) -> np.ndarray:
+    """[S, S, 3] float32 tangent-space normals * 0.5 + 0.5, y up, flat where there is no surface. turn [T, 2]; None:
+    flat everywhere."""
+    image = np.tile(np.array([0.5, 0.5, 1.0], np.float32), (surface.size, surface.size, 1))
+    if turn is not None:
+        normal = normalised(np.concatenate([turn, np.ones((len(turn), 1), turn.dtype)], axis=1))
+        image.reshape(-1, 3)[surface.pixel] = 0.5 * normal + 0.5
+    return image
