@@ -159,7 +159,7 @@ def test_rows_are_kept_and_only_what_is_missing_runs(toy, tmp_path, monkeypatch,
     monkeypatch.setattr(stress, "code_version", lambda: "other code")
     stress.main([str(tmp_path), "--keep-old"])
     assert len(toy) == 5
-    assert "made with other code" in (tmp_path / "stress.md").read_text()
+    assert "an earlier version of a stage" in (tmp_path / "stress.md").read_text()
     stress.main([str(tmp_path), "--dials", "other"])
     assert toy[5:] == ["unspoilt", "other_1"]
 
@@ -176,10 +176,13 @@ def test_table_and_chart_show_every_row(toy, tmp_path):
     assert [(r["dial"], r["severity"], r["verdict"]) for r in rows] == [
         ("toy", "0", RIGHT), ("toy", "1", WARNED), ("toy", "2", SILENT), ("other", "0", RIGHT), ("other", "1", RIGHT)]
     page = (tmp_path / "docs" / "stress.md").read_text()
-    assert "| a toy | 2 units |" in page and "**99**" in page and "wrong and silent or failed: 1" in page
+    assert "| a toy | 2 units |" in page and "**99**" in page
+    assert "3 cases, wrong and silent or failed: 1" in page and "Not run yet" not in page
     chart = (tmp_path / "docs" / "stress.svg").read_text()
     assert chart.count("<polyline") == 2 * len(LIMITS) and chart.count("<title>") == 5
+    stress.row_file(tmp_path, TOY[0].make(1.0)).unlink()
     assert stress.main([str(tmp_path), "--table"]) == 1
+    assert "Not run yet: a toy (1)." in (tmp_path / "stress.md").read_text()
 
 
 def test_an_unknown_dial_is_refused(tmp_path, capsys):

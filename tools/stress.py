@@ -6,36 +6,34 @@
 Makes each dial's subjects (stress_dials), runs Limn on them with small settings (stress_run), scores the results
 against the truth and passes the verdict by a stated rule (stress_judge): right, degraded and said so, or wrong and
 silent. Writes WORK/rows/, one file per case, and from them DOCS/stress.csv, stress.md and stress.svg; --table does
-only that. A case that has a row of the same code is not run again, so that a test that was stopped goes on; --minutes:
-no case begins later. Exit code 1 when a case is wrong and silent or failed.
+only that. A case that has a row of the same versions is not run again, so that a test that was stopped goes on;
+--minutes: no case begins later. Exit code 1 when a case is wrong and silent or failed.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import shutil
 import sys
 import time
-from functools import cache
 from pathlib import Path
 
 from shared.contract.pipeline import REPOSITORY, load_pipeline
-from shared.contract.source import fingerprint
+from shared.contract.source import read_declaration
 from shared.errors import InputError
 from shared.io.arrays import read_json, write_json
 from tools.stress_dials import DIALS, Case, Dial
 from tools.stress_judge import FAILED, SILENT, judge
 from tools.stress_table import write_tables
 
+VERSION = 1
+"""Raise it when subjects are made, run or scored in another way."""
 
-@cache
+
 def code_version() -> str:
-    """Digest of all code that decides a result, and of pipeline.yaml; comments and layout do not count."""
-    files = [*(REPOSITORY / "shared").rglob("*.py"), *(REPOSITORY / "stages").glob("*.py"),
-             *(REPOSITORY / "tools" / f"stress_{name}.py" for name in ("camera", "run", "subject"))]
-    parts = [fingerprint(path) for path in sorted(files)] + [(REPOSITORY / "pipeline.yaml").read_text("utf-8")]
-    return hashlib.sha256("".join(parts).encode()).hexdigest()[:12]
+    """The versions of the stages that make a result, and this test's own: rows of another one are made again."""
+    stages = (REPOSITORY / "stages" / f"{name}.py" for name in ("sample_frames", "track_landmarks", "inverse_render"))
+    return ".".join(str(version) for version in (VERSION, *(read_declaration(path).version for path in stages)))
 
 
 def cases_of(dials: list[Dial]) -> list[tuple[str, Case]]:
@@ -101,13 +99,19 @@ def verdicts(work: Path) -> list[dict]:
     return rows
 
 
+def missing_cases(work: Path) -> list[str]:
+    """Dials with the severities that have not been run, in words."""
+    left = ((dial, [f"{s:g}" for s in dial.severities if known_row(work, dial.make(s)) is None]) for dial in DIALS)
+    return [f"{dial.what} ({', '.join(severities)})" for dial, severities in left if severities]
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path, help="folder for takes, subjects, runs and rows")
     parser.add_argument("--dials", default="", help=f"only these, by commas, of {', '.join(d.name for d in DIALS)}")
     parser.add_argument("--minutes", type=float, default=1e9, help="begin no case later than this")
-    parser.add_argument("--keep-old", action="store_true", help="rows of other code stand; the table marks them")
+    parser.add_argument("--keep-old", action="store_true", help="rows of other versions stand; the table marks them")
     parser.add_argument("--table", action="store_true", help="run nothing, write the tables from what there is")
     parser.add_argument("--docs", type=Path, help="where the tables go (default: WORK)")
     options = parser.parse_args(arguments)
@@ -119,7 +123,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     if rows:
-        write_tables(rows, options.docs or options.work, code_version())
+        write_tables(rows, missing_cases(options.work), options.docs or options.work, code_version())
     bad = [f"{row['dial'].name} {row['severity']:g}" for row in rows if row["verdict"].word in (SILENT, FAILED)]
     print(f"{len(rows)} rows; wrong and silent, or failed: {', '.join(bad) or 'none'}"
           + "; not complete: call again to go on" * (not complete))

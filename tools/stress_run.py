@@ -42,7 +42,8 @@ def run_case(subject: Path, out: Path, pipeline: Pipeline) -> dict:
     for stage in SETTINGS:
         code, message = _run_stage(stage, subject, out)
         if code:
-            return {"exit": code, "message": message, "seconds": time.monotonic() - began, "scores": {},
+            named = message.replace(str(subject), "the subject")
+            return {"exit": code, "message": named, "seconds": time.monotonic() - began, "scores": {},
                     "warnings": warnings_of(run), "gates": {}, "missed_gates": []}
     seconds = time.monotonic() - began
     export_maps(run)

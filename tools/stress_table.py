@@ -14,15 +14,15 @@ _COLUMNS = ("dial", "severity", "unit", "verdict", "wrong", "said", *_SHOWN, "ga
             "seconds", "code")
 
 
-def write_tables(rows: Sequence[dict], folder: Path, code: str) -> None:
-    """All three; rows of stress.verdicts, code: version that rows should have."""
+def write_tables(rows: Sequence[dict], missing: Sequence[str], folder: Path, code: str) -> None:
+    """All three; rows of stress.verdicts, missing: what has not been run, code: version that rows should have."""
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "stress.csv", "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(_csv_row(row) for row in rows)
     write_chart(rows, folder / "stress.svg")
-    (folder / "stress.md").write_text("\n".join(_page(rows, code)) + "\n", encoding="utf-8")
+    (folder / "stress.md").write_text("\n".join(_page(rows, missing, code)) + "\n", encoding="utf-8")
 
 
 def _csv_row(row: dict) -> dict:
@@ -36,7 +36,7 @@ def _csv_row(row: dict) -> dict:
     }
 
 
-def _page(rows: Sequence[dict], code: str) -> list[str]:
+def _page(rows: Sequence[dict], missing: Sequence[str], code: str) -> list[str]:
     """The Markdown page's lines."""
     bad = [row for row in rows if row["verdict"].word in (SILENT, FAILED)]
     zero = rows[0]["scores"]
@@ -52,13 +52,17 @@ def _page(rows: Sequence[dict], code: str) -> list[str]:
         "| score | what | limit | growth | at 0 |", "|---|---|---|---|---|",
         *(f"| {name} | {limit.what} | {limit.most:g} {limit.unit} | {limit.growth:g} | {zero[name]:.3g} |"
           for name, limit in LIMITS.items()), "",
-        f"{len(rows)} rows, wrong and silent or failed: {len(bad)}.", "",
+        f"{sum(row['severity'] > 0 for row in rows)} cases, wrong and silent or failed: {len(bad)}. Bold scores are "
+        f"wrong. Gates that the dial at 0 misses, which do not count: {'; '.join(rows[0]['missed_gates']) or 'none'}.",
+        "",
         "| dial | severity | " + " | ".join(LIMITS) + " | verdict | what Limn said |",
         "|---|---|" + "---|" * len(LIMITS) + "---|---|",
         *(_line(row, zero, row["code"] != code) for row in rows if row["severity"]),
     ]
     if any(row["code"] != code for row in rows):
-        lines += ["", "\\* made with other code than the rest"]
+        lines += ["", "\\* made with an earlier version of a stage"]
+    if missing:
+        lines += ["", f"Not run yet: {'; '.join(missing)}."]
     return lines
 
 
