@@ -2,6 +2,7 @@
 # make test    set-up, then all tests
 # make setup   the set-up alone
 # make chart   set-up, then speed against accuracy on the embedded subject (20 minutes); CASES=all SUBJECT=DIR: more
+# make stress  set-up, then where Limn fails and whether it says so (an hour on one core; goes on where it was stopped)
 # make audit   licences, changed files, bill of materials; ADVISORIES=all.zip: known vulnerabilities, too
 PYTHON ?= python3
 VENV := .venv
@@ -10,7 +11,7 @@ STAMP := $(VENV)/.installed
 CASES ?= quick
 OUT ?= build/chart
 
-.PHONY: setup demo test chart lint audit clean
+.PHONY: setup demo test chart stress lint audit clean
 
 setup: $(STAMP)
 	$(BIN)/python -m tools.check_host
@@ -30,6 +31,9 @@ test: setup
 
 chart: setup
 	$(BIN)/python -m tools.chart $(SUBJECT) --cases $(CASES) --out $(OUT)
+
+stress: setup
+	$(BIN)/python -m tools.stress build/stress
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
