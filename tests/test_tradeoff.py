@@ -88,7 +88,7 @@ def toy(tmp_path, monkeypatch):
     monkeypatch.setattr(tradeoff_runs, "_EXPORTED", "export_page")
     trust([TOY])
     subject = load_subject(make_subject(tmp_path / "poem"))
-    return Runs(tmp_path / "work", subject, load_pipeline(TOY / "pipeline.yaml"), sys.executable)
+    return Runs(tmp_path / "work", subject, "its key", load_pipeline(TOY / "pipeline.yaml"), sys.executable)
 
 
 def test_cases_share_the_stages_that_they_have_in_common(toy):
@@ -109,7 +109,18 @@ def test_what_is_done_is_kept_until_its_code_changes(toy, monkeypatch):
     again = toy.solve(case)[0]
     assert again.costs["count_words"] == first.costs["count_words"]
     assert again.costs["draw_bars"] != first.costs["draw_bars"] and again.digest == first.digest
-    assert "changed" not in again.code.values()
+    monkeypatch.setitem(tradeoff_runs._known, next(name for name in first.code if "read_text" in name), "changed")
+    anew = toy.solve(case)[0]
+    assert not set(again.costs.values()) & set(anew.costs.values())
+
+
+def test_a_stage_that_was_cut_off_is_measured_from_its_start(toy):
+    case = ChartCase("plain", "ablation", "standard")
+    first = toy.solve(case)[0]
+    for path in toy.work.glob("*/measured.json"):
+        path.unlink()
+    again = toy.solve(case)[0]
+    assert again.digest == first.digest and not set(again.costs.values()) & set(first.costs.values())
 
 
 def test_a_stage_that_fails_says_why_and_leaves_the_earlier_ones(toy, monkeypatch):

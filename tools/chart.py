@@ -93,7 +93,9 @@ class Chart:
         if self.rows.dropped:
             print(f"{self.rows.dropped} rows of other code or another subject are measured anew")
         for repeat in range(repeats):
-            runs = Runs(self.work / f"repeat{repeat}", self.subject, self.pipeline, self.peer_python)
+            runs = Runs(
+                self.work / f"repeat{repeat}", self.subject, self.rows.subject_key, self.pipeline, self.peer_python
+            )
             for case in self.cases:
                 if case.group == PEER and not self.has_peer:
                     print(f"{case.name}: left out, mitsuba is not installed (pip install mitsuba, or --peer-python)")

@@ -77,22 +77,23 @@ def fingerprints(names: Sequence[str]) -> dict[str, str]:
 
 
 class Runs:
-    """One repeat's tree of runs below work."""
+    """One repeat's tree of runs below work. subject_key: of the subject's content."""
 
-    def __init__(self, work: Path, subject: Subject, pipeline: Pipeline, peer_python: str):
+    def __init__(self, work: Path, subject: Subject, subject_key: str, pipeline: Pipeline, peer_python: str):
         self.work, self.subject, self.pipeline, self.peer_python = work, subject, pipeline, peer_python
+        self.subject_key = subject_key
 
     def solve(self, case: ChartCase) -> list[Solved]:
         """The case's results: one, or a peer's at each of its seconds. InputError where a stage fails."""
         parameters = self._parameters(case)
         names = list(self.pipeline.stages)
         last = _TRACKED if case.seconds else _EXPORTED if case.whole else _SOLVED
-        key, costs, code, node = "", {}, {}, None
+        key, costs, code, node = self.subject_key, {}, {}, None
         for name in names[: names.index(last) + 1]:
             key = hash_value([key, name, parameters[name], len(os.sched_getaffinity(0))])[:16]
-            node = self._stage(name, case, key, node)
+            node = self._stage(name, case, key, node, code)
             record = read_json(node / MEASURED)
-            costs[name], code = Cost(**record["cost"]), code | record["code"]
+            costs[name], code = Cost(**record["cost"]), record["code"]
         if case.seconds:
             return self._peer(case, key, node, costs, code)
         root = node / self.subject.name
@@ -105,15 +106,14 @@ class Runs:
         return {name: self.pipeline.parameters(stage, case.preset, given.get(name, {})) for name, stage in
                 stages.items()}  # fmt: skip
 
-    def _stage(self, name: str, case: ChartCase, key: str, parent: Path | None) -> Path:
-        """The node of a stage, done now unless it is there."""
+    def _stage(self, name: str, case: ChartCase, key: str, parent: Path | None, code: Mapping[str, str]) -> Path:
+        """The node of a stage, done now unless it is there; code: of the stages before it."""
         node = self.work / key
         if (node / MEASURED).is_file():
             if current_code(read_json(node / MEASURED)["code"]):
                 return node
-            shutil.rmtree(node)
+        shutil.rmtree(node, ignore_errors=True)
         if parent is not None:
-            shutil.rmtree(node, ignore_errors=True)
             # Links on the file system share the content; a stage never writes into another's folder.
             shutil.copytree(parent / self.subject.name, node / self.subject.name, copy_function=os.link)
         given = split_settings(case.settings, self.pipeline.stages).get(name, {})
@@ -126,7 +126,7 @@ class Runs:
         root = node / self.subject.name
         folder = root / folder_of(name)
         provenance = read_json(folder / PROVENANCE)
-        code = {file: digest[:SHOWN] for file, digest in provenance["code"].items()}
+        code = {**code, **{file: digest[:SHOWN] for file, digest in provenance["code"].items()}}
         cost["peak_mb"] = provenance["peak_memory_mb"]
         write_json(node / MEASURED, {"stage": name, "cost": cost, "code": code})
         return node
