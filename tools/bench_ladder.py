@@ -3,10 +3,10 @@
     python -m tools.bench_ladder RUN [RUN ...] --out TABLE.csv [--set key=value ...] [--rungs auto cubemap_16 ...]
 
 RUN: a run's folder whose work/ holds sample_frames and track_landmarks. Light and mesh are solved with model=auto and
-with each fixed model, without the texture pass, which all share. Every fixed model counts twice, with the tracked mesh
-and with the refined one. Rows that TABLE.csv holds already are kept, so that an interrupted table goes on. At the end,
-for each clip: the ladder's error and seconds relative to those of the fixed rung with the least error (mean absolute,
-by which the ladder chooses; beside it the root mean square relative to the least one).
+with each fixed model, without the outline and the texture pass, which all share. Every fixed model counts twice, with
+the tracked mesh and with the refined one. Rows that TABLE.csv holds already are kept, so that an interrupted table goes
+on. At the end, for each clip: the ladder's error and seconds relative to those of the fixed rung with the least error
+(mean absolute, by which the ladder chooses; beside it the root mean square relative to the least one).
 
 CPU seconds of one thread: on a machine that others use too, the clock on the wall says little.
 """
