@@ -24,6 +24,10 @@ _LARGEST_RISE, _LARGEST_FALL = 1.5, 4.0
 """Bounds on a step of the log light, each texel by itself: the linearisation of exp holds for a rise of this size; a
 texel that wants to go dark may fall further, and must not slow the others down."""
 
+PRECISION, PRECISION_OF_SEVERAL = (15, 0.02), (60, 0.002)
+"""Most products of a step, and by how much its residual must fall. One light's errors against another's, with an albedo
+between them, are what the samples tell least of, and come last: steps that stop before leave them in the albedo."""
+
 
 def conjugate_gradients(
     product: Callable, right: np.ndarray, count: int, tolerance: float = 0.02
@@ -145,7 +149,7 @@ class LightStep:
         """Gauss-Newton Hessian times a change [M, 3]."""
         return self.evidence * self._adjoint(self.weight * self._render(change)) + self.prior_product(change)
 
-    def take(self, products: int = 15) -> None:
+    def take(self) -> None:
         """Moves the solver's light at constant mean irradiance per channel; halved until the cost falls.
 
         The scale is left to settle: steps x are taken as Q x with Q = 1 - u g', where u raises the log light by one
@@ -163,7 +167,10 @@ class LightStep:
             return change - gauge * (unit * change).sum(0)
 
         right = -level_transposed(self.gradient())
-        solved = conjugate_gradients(lambda x: level_transposed(self.product(level(x))), right, products)
+        count, tolerance = PRECISION_OF_SEVERAL if len(self.solver.light_frames) > 1 else PRECISION
+        solved = conjugate_gradients(
+            lambda x: level_transposed(self.product(level(x))), right, count, tolerance
+        )
         step = level(np.clip(level(solved), -_LARGEST_FALL, _LARGEST_RISE))
         self.before = self.cost(state.params)
         for _ in range(6):
