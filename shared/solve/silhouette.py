@@ -27,6 +27,10 @@ from shared.solve.shape_samples import projection_slope
 from shared.solve.shape_step import large_step_metric
 
 CAUCHY_SCALE, FARTHEST_SIGMAS = 2.5, 8.0
+LEAST_MET = 2.0 / 3.0
+"""Share of the outline that has to have a border within reach. Where hair or a hat makes the border, a part of it comes
+near by chance, and the head would grow out to meet it: long hair leaves 0.16 and 0.59, bare and cropped heads 0.71 to
+1."""
 BEYOND_PX = 2.5
 """How far outside of the outline a ray has to miss the mesh."""
 
@@ -60,14 +64,16 @@ class Outlines:
 
 @dataclass(frozen=True)
 class Rim:
-    """Rim points of all frames: frame [n], edge [n, 2], share [n] of the way along it, slope [n, 3] of the distance by
-    the point's place, px per mm, distance [n] px."""
+    """Rim points of all frames that have a border near: frame [n], edge [n, 2], share [n] of the way along it, slope
+    [n, 3] of the distance by the point's place, px per mm, distance [n] px; met: how many of all rim points these are.
+    """
 
     frame: np.ndarray
     edge: np.ndarray
     share: np.ndarray
     slope: np.ndarray
     distance: np.ndarray
+    met: float
 
 
 def mask_distance(mask: np.ndarray) -> np.ndarray:
@@ -85,7 +91,7 @@ def rim_of(mesh: Mesh, usable: np.ndarray, outlines: Outlines, reach_mm: float) 
     """The mesh's rim in the frames. usable [faces] bool: faces whose edges count."""
     normals, scene = vertex_normals(mesh.vertices, mesh.faces), RayScene(mesh.vertices, mesh.faces)
     edges = mesh_edges(mesh.faces[usable])[0]
-    parts = []
+    parts, count = [], 0
     frames = zip(outlines.distance, outlines.camera_from_head, outlines.intrinsics, strict=True)
     for f, (distance, pose, lens) in enumerate(frames):
         turning, share, outward = _turning_points(mesh, normals, edges, scene, pose, lens)
@@ -94,9 +100,11 @@ def rim_of(mesh: Mesh, usable: np.ndarray, outlines: Outlines, reach_mm: float) 
         apart = remap(distance, pixels).astype(np.float64)
         inside = ((pixels > 1.0) & (pixels < np.array(distance.shape[::-1]) - 1.0)).all(1)
         near = inside & (np.abs(apart) < reach_mm * lens[0, 0] / depth)
+        count += int(inside.sum())
         slope = np.einsum("nix,ni->nx", projection_slope(points, pose, lens), outward)
         parts.append((np.full(near.sum(), f), turning[near], share[near], slope[near], apart[near]))
-    return Rim(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    arrays = [np.concatenate(part) for part in zip(*parts, strict=True)]
+    return Rim(*arrays, met=len(arrays[0]) / max(count, 1))
 
 
 def _turning_points(mesh, normals, edges, scene, pose, intrinsics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -135,6 +143,9 @@ def fit_outline(
     prior = prior + sparse.diags(known[: spread.shape[1]] / settings.known_mm**2)
     start, moved = mesh.vertices, np.zeros((spread.shape[1], 3))
     rim = rim_of(mesh, usable, outlines, settings.reach_mm)
+    if rim.met < LEAST_MET:
+        note(f"outline: {rim.met:.0%} of it lies near the masks' borders: they are not the head's")
+        return mesh, {"met": rim.met}
     first = best = _mean_distance(rim, outlines.fitted, settings)
     for _ in range(settings.rounds):
         moved = moved + _step(spread, prior, moved, rim, outlines.fitted, settings)
@@ -146,7 +157,7 @@ def fit_outline(
             break
         mesh, best = trial, now
     pairs = zip(("fitted_px", "held_out_px"), first, best, strict=True)
-    return mesh, {name: {"before": before, "after": after} for name, before, after in pairs}
+    return mesh, {"met": rim.met} | {name: {"before": before, "after": after} for name, before, after in pairs}
 
 
 def _before_subdivision(mesh: Mesh) -> tuple[sparse.csr_matrix, np.ndarray]:
