@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
@@ -94,7 +95,7 @@ DIALS = (
     Dial("smile", "an expression that changes mid-clip", "strength", (0.4, 1.0),
          lambda s: _seen(smile=s), r"expression|mouth|do not fit"),
     Dial("wrong_focal", "a wrong focal length", "log of stated over true", (0.1, 0.3),
-         lambda s: Case(focal_gain=float(2.718281828**s)), r"focal"),
+         lambda s: Case(focal_gain=math.exp(s)), r"focal"),
     Dial("narrow_turn", "a turn too small", "degrees short of the usual 27", (15.0, 22.0),
          lambda s: _seen(yaw_deg=27.0 - s, pitch_deg=max(12.0 - 0.5 * s, 2.0)), r"changes by only|turn"),
     Dial("wide_turn", "a wide turn", "degrees beyond the usual 27", (18.0,),

@@ -70,13 +70,13 @@ class SmoothField:
 @dataclass(frozen=True)
 class EquationSettings:
     """noise: absolute and relative standard deviation of a sample; correlated: how many samples count as one
-    independent; smooth_mm: width over which residuals are laid to light and pose, 0: none are."""
+    independent; smooth_mm: width over which residuals are laid to light and pose, 0: none are; shadow_mm: how far off
+    the borders of cast shadows may be."""
 
     noise: tuple[float, float] = (0.006, 0.03)
     correlated: float = 5.0
     smooth_mm: float = 12.0
     shadow_mm: float = 2.5
-    local: float = 0.0
 
 
 def point_equations(
@@ -111,11 +111,8 @@ def point_equations(
     weighted = weight * terms.irradiance
     slopes -= terms.irradiance[..., None] * ((weighted[..., None] * slopes).sum(1) / power[..., None])[:, None]
     error -= terms.irradiance * ((weighted * error).sum(1) / power)[:, None]
-    misfit = (weight * error**2).sum((1, 2)), (weight > 0).sum((1, 2))
-    whole = max(1.0, float(misfit[0].sum() / max(misfit[1].sum(), 1)))
-    if settings.local > 0:
-        whole = np.maximum(whole, (misfit[0] / np.maximum(misfit[1], 1)) ** settings.local)
-    evidence = np.broadcast_to(share / (whole * settings.correlated), (len(points),))[:, None, None]
+    misfit = max(1.0, float((weight * error**2).sum((1, 2)).sum() / max((weight > 0).sum(), 1)))
+    evidence = np.float64(share / (misfit * settings.correlated))
     rows = slopes.reshape(len(slopes), -1, 3)
     scaled = rows * (evidence * weight).reshape(len(slopes), -1, 1)
     hessian = np.swapaxes(scaled, 1, 2) @ rows

@@ -29,8 +29,8 @@ from shared.solve.shape_step import large_step_metric
 CAUCHY_SCALE, FARTHEST_SIGMAS = 2.5, 8.0
 LEAST_MET = 2.0 / 3.0
 """Share of the outline that has to have a border within reach. Where hair or a hat makes the border, a part of it comes
-near by chance, and the head would grow out to meet it: long hair leaves 0.16 and 0.59, bare and cropped heads 0.71 to
-1."""
+near by chance, and the head would grow out to meet it. Long hair leaves 0.16 and 0.59, bare and cropped heads over 0.7.
+"""
 BEYOND_PX = 2.5
 """How far outside of the outline a ray has to miss the mesh."""
 
