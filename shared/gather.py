@@ -81,6 +81,11 @@ class SurfaceViewer:
         adjacency = sparse.coo_matrix((np.ones(len(edges), np.float32), edges.T), shape=shape).tocsr()
         self._adjacency = adjacency + adjacency.T
 
+    @classmethod
+    def of(cls, mesh: Mesh) -> SurfaceViewer:
+        """With a scene of the mesh alone."""
+        return cls(mesh, RayScene(mesh.vertices, mesh.faces))
+
     def view(self, camera_from_head: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]) -> View:
         """All vertices in one camera. size: (width, height) of the picture in pixels."""
         vertices = self.mesh.vertices

@@ -89,12 +89,11 @@ def run(job: Job) -> None:
     from shared.io.arrays import write_json
     from shared.io.clip_inputs import read_inputs
     from shared.io.images import write_exr, write_png
-    from shared.raycast import RayScene
     from shared.texels import TexelSurface
 
     inputs = read_inputs(job.input("sample_frames"), job.input("track_landmarks"))
     mesh = inputs.mesh
-    surface, viewer = TexelSurface(mesh, job.params.size), SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
+    surface, viewer = TexelSurface(mesh, job.params.size), SurfaceViewer.of(mesh)
     mean, weight = average_frames(job, inputs, surface, viewer)
     names = inputs.segment_names if inputs.face_segment is not None else ("head",)
     face_segment = np.zeros(len(mesh.faces), np.uint8) if inputs.face_segment is None else inputs.face_segment

@@ -120,7 +120,7 @@ def test_bumps_finer_than_the_mesh_are_found_and_none_where_there_are_none(bumpy
         np.full(len(surface), 400.0),
     )
     clip = Clip(pictures.__getitem__, poses, LENS, np.arange(FRAMES) % 4 != 2)
-    viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
+    viewer = SurfaceViewer.of(mesh)
     turn, record = NormalPass(surface, viewer, shading, clip, material).run(1.0)
     front = places[:, 2] > 60.0
     if not bumpy:

@@ -10,7 +10,6 @@ from toy_clip import FRAMES, LENS, MAP, SIZE, toy_clip, true_maps
 from shared.contract.job import Parameters
 from shared.errors import InputError
 from shared.gather import SurfaceViewer
-from shared.raycast import RayScene
 from shared.solve.capture import Sizes
 from shared.solve.frame_choice import covering_frames
 from shared.solve.inverse import InverseSettings, frames_to_fit, solve_clip, summarise
@@ -152,7 +151,7 @@ def test_large_steps_are_a_change_of_variables(clip):
 
 def test_few_frames_cover_the_face(clip):
     """Three of nine: one from either side and one between; they alone are fitted, the others judge."""
-    viewer = SurfaceViewer(clip.mesh, RayScene(clip.mesh.vertices, clip.mesh.faces))
+    viewer = SurfaceViewer.of(clip.mesh)
     front = clip.mesh.vertices[:, 2] > 10.0
     chosen = covering_frames(viewer, front, clip.camera_from_head, LENS, SIZE, 3)
     assert len(set(chosen.tolist())) == 3 and chosen[0] <= 1 and chosen[-1] >= FRAMES - 2

@@ -115,7 +115,7 @@ class FlatShading:
 def test_maps_are_read_at_the_pixels_place():
     """A plate that fills 64 x 64 pixels, texture rows from the top: the picture is the texture."""
     plate = grid_plane(5, 100.0)
-    viewer = SurfaceViewer(plate, RayScene(plate.vertices, plate.faces))
+    viewer = SurfaceViewer.of(plate)
     rng = np.random.default_rng(0)
     albedo, specular = rng.uniform(size=(64, 64, 3)).astype(np.float32), rng.uniform(size=(64, 64)).astype(np.float32)
     lens = np.array([[320.0, 0, 32], [0, 320.0, 32], [0, 0, 1]])

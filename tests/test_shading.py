@@ -256,7 +256,7 @@ def test_trust_fades_towards_the_mask():
 
 def test_the_camera_sees_the_front_of_a_ball():
     ball = sphere(40.0, 4)
-    viewer = SurfaceViewer(ball, RayScene(ball.vertices, ball.faces))
+    viewer = SurfaceViewer.of(ball)
     pose = nods(np.array([0.0]), distance=400.0)[0]
     view = viewer.view(pose, LENS, (160, 120))
     towards = normalised(np.array([0, 0, 400.0]) - ball.vertices)
@@ -288,7 +288,7 @@ def test_what_lies_behind_an_edge_is_left_out_with_a_margin():
 def test_samples_are_the_colours_behind_the_vertices():
     """The picture shows each pixel's own coordinates, so samples must equal the projections."""
     ball = sphere(40.0, 3)
-    viewer = SurfaceViewer(ball, RayScene(ball.vertices, ball.faces))
+    viewer = SurfaceViewer.of(ball)
     v, u = np.mgrid[0:120, 0:160] + 0.5
     picture = flat_picture(linear=np.stack([u, v, 0 * u + 1], axis=-1).astype(np.float32))
     poses = nods(np.array([0.0, 25.0]), distance=450.0)

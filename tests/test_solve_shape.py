@@ -55,7 +55,7 @@ class Toy:
 
 def shade(mesh, poses, light):
     """Vertex shading, its scenery and material under a light."""
-    viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
+    viewer = SurfaceViewer.of(mesh)
     scenery = set_scenery(viewer, SIZES)
     points = mesh_points(mesh)
     material = Material(true_albedo(scenery.nodes.points.positions), SPECULAR, ROUGHNESS)

@@ -216,7 +216,7 @@ def plate_clip(mesh, shading, clip_at=np.inf):
 def run_pass(clip_at=np.inf, specular=SPECULAR, widths=(np.inf,)):
     mesh = grid_plane(33, 80.0)
     shading = PlateShading(mesh)
-    surface, viewer = TexelSurface(mesh, MAP), SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
+    surface, viewer = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh)
     clip = plate_clip(mesh, shading, clip_at)
     texture = TexturePass(surface, viewer, shading, clip, specular, np.array([0.5, 0.4, 0.25]))
     material, record = texture.run(widths)
@@ -260,7 +260,7 @@ def test_unseen_texels_are_filled_and_not_trusted(plate):
 def test_more_frames_mean_more_confidence():
     mesh = grid_plane(17, 80.0)
     shading, surface = PlateShading(mesh), TexelSurface(mesh, 24)
-    viewer, found = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces)), []
+    viewer, found = SurfaceViewer.of(mesh), []
     clip = plate_clip(mesh, shading)
     for fitted in (np.arange(FRAMES) == 0, clip.fitted):
         few = Clip(clip.picture, clip.camera_from_head, LENS, fitted)

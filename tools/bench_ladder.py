@@ -26,7 +26,6 @@ from shared.gather import SurfaceViewer
 from shared.geometry import fibonacci_sphere
 from shared.io.clip_inputs import ClipInputs, read_inputs
 from shared.lobes import LobeTable, specular_tables
-from shared.raycast import RayScene
 from shared.solve.fit_appearance import Solution
 from shared.solve.inverse import frames_to_fit, solve_light
 from tools.bench_appearance import settings_of, silent
@@ -77,7 +76,7 @@ def compile_loops() -> None:
 def measure(inputs: ClipInputs, clip: str, rung: str, given: dict) -> list[dict]:
     """The table's rows of one rung on one clip: of a fixed one with the tracked mesh and with the refined one."""
     settings, clock = settings_of({**given, **RUNGS[rung]}), Clock()
-    viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
+    viewer = SurfaceViewer.of(inputs.mesh)
     fitted = frames_to_fit(inputs, settings, viewer)
     lit = solve_light(inputs, settings, viewer, fitted, None, clock.progress, print if rung == "auto" else silent)
     seconds, appearance, shape = clock.seconds(), lit.settings.appearance, lit.shape_record

@@ -25,7 +25,6 @@ from pathlib import Path
 import numpy as np
 
 from shared.gather import SurfaceViewer
-from shared.raycast import RayScene
 from shared.solve.inverse import frames_to_fit, solve_clip
 from shared.solve.reference import ReferenceSolver
 from shared.solve.reference_clip import solve_by_reference
@@ -149,7 +148,7 @@ def solve_reference(options, inputs, index: np.ndarray, changes: dict, log: Log)
     checkpoint = options.out / f"{options.label}.checkpoint.npz"
     reference = replace(settings.reference, checkpoint=checkpoint, checkpoint_every=10)
     fitted = frames_to_fit(
-        inputs, settings, SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
+        inputs, settings, SurfaceViewer.of(inputs.mesh)
     )
     scored = _Scored(log, options.label, options.subject, inputs, index, options.minutes)
     try:

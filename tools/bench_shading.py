@@ -29,7 +29,6 @@ from shared.io.images import write_exr
 from shared.io.models import load_head_model
 from shared.lobes import LobeTable, specular_reflection
 from shared.mesh import Mesh, normalised, subdivide
-from shared.raycast import RayScene
 from shared.render import SurfaceMaps, render_frame
 from shared.shading import light_along
 from shared.solve.capture import Scenery, Sizes, face_front, set_scenery
@@ -84,7 +83,7 @@ class Stage:
     def of(cls, mesh: Mesh, light: np.ndarray, pixels: int, sizes: Sizes = SIZES) -> Stage:
         """light: lat-long [H, 2 H, 3] in the mesh's space; both renderers see it through the same coarse cubemap."""
         viewer, camera = (
-            SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces)),
+            SurfaceViewer.of(mesh),
             orbit_camera(mesh, YAW_DEG, PITCH_DEG, pixels),
         )
         scenery = set_scenery(viewer, sizes)

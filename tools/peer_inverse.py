@@ -30,7 +30,6 @@ from shared.io.arrays import save_arrays, write_json
 from shared.io.clip_inputs import read_inputs
 from shared.io.images import write_exr
 from shared.io.meshes import write_obj
-from shared.raycast import RayScene
 from shared.solve.capture import spread_frames
 from shared.solve.inverse import FACE_SKIN, segment_vertices
 from shared.solve.reference_clip import START_FRAMES, Start, average_texture, make_start
@@ -204,7 +203,7 @@ def main(arguments: list[str] | None = None) -> int:
     os.environ.setdefault(peer_mitsuba.VARIABLE, VARIANT)
     try:
         inputs = read_inputs(*(options.run / "work" / name for name in STAGES))
-        viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
+        viewer = SurfaceViewer.of(inputs.mesh)
         some = spread_frames(len(inputs.frame_index), START_FRAMES)
         average = average_texture(inputs, viewer, MAP_SIZE, some, lambda items, label="": items)
         start = make_start(average, segment_vertices(inputs, FACE_SKIN), WHITE_SIGMA, specular=True)

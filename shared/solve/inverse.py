@@ -11,7 +11,6 @@ import numpy as np
 from shared.chart import ChartSight
 from shared.gather import Picture, SurfaceViewer
 from shared.mesh import Mesh
-from shared.raycast import RayScene
 from shared.read_ahead import read_ahead
 from shared.shading import Material, VertexShading
 from shared.solve.appearance import Capture, Settings
@@ -131,7 +130,7 @@ def solve_clip(
 ) -> InverseResult:
     """The whole of it. progress(items, label) wraps loops, note(text) logs a line; sights: of a colour chart in view.
     """
-    viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
+    viewer = SurfaceViewer.of(inputs.mesh)
     fitted = frames_to_fit(inputs, settings, viewer)
     if settings.reference is not None:
         from shared.solve.reference_clip import solve_by_reference
@@ -141,7 +140,7 @@ def solve_clip(
     if settings.shape is not None and settings.shape.rim is not None and inputs.face_segment is not None:
         frames = frames_of(inputs, settings, settings.shape.rim.frames, fitted)
         inputs, outline = meet_outline(inputs, frames, settings.shape.rim, note)
-        viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
+        viewer = SurfaceViewer.of(inputs.mesh)
     moves = settings.appearance.light_moves(inputs.moves)
     light = int(inputs.light_index[sights[0].frame]) if sights else 0
     chart, warning = state_chart(sights, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves, light)
@@ -183,14 +182,14 @@ def solve_light(
         climbed = climb(inputs, settings, fitted, chart, progress, note)
         inputs, settings, start, gloss = climbed.inputs, climbed.settings, climbed.start, climbed.gloss
         shape_record, rungs = climbed.shape_record, climbed.rungs
-        viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
+        viewer = SurfaceViewer.of(inputs.mesh)
     scenery = set_scenery(viewer, settings.sizes, settings.appearance.visibility)
     solution, capture = _fit_light(inputs, settings, viewer, scenery, fitted, chart, progress, note, start)
     if settings.shape is not None and inputs.face_segment is not None:
         known = Reflectance.of(solution, scenery)
         frames = frames_of(inputs, settings, settings.shape.frames, fitted)
         reshaped = reshape(inputs, frames, known, settings.appearance, settings.sizes, settings.shape, progress, note)
-        viewer_then = SurfaceViewer(reshaped.mesh, RayScene(reshaped.mesh.vertices, reshaped.mesh.faces))
+        viewer_then = SurfaceViewer.of(reshaped.mesh)
         scenery_then = set_scenery(viewer_then, settings.sizes, settings.appearance.visibility)
         more = viewer_then, scenery_then, fitted, chart, progress, note, solution
         then, capture_then = _fit_light(reshaped, settings, *more)

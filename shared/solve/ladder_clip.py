@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shared.gather import SurfaceViewer
-from shared.raycast import RayScene
 from shared.solve.capture import Sizes, hold_out, set_scenery, spread_frames
 from shared.solve.fit_appearance import Solution
 from shared.solve.inverse import InverseInputs, InverseSettings, capture_skin, frames_of
@@ -42,7 +41,7 @@ class SmallClip:
     def __init__(self, inputs: InverseInputs, settings: InverseSettings, fitted: np.ndarray, chart, progress: Callable):
         self.inputs, full = inputs, settings.sizes
         self.sizes = Sizes(*(min(getattr(full, name), getattr(CLIMB_SIZES, name)) for name in vars(CLIMB_SIZES)))
-        viewer = SurfaceViewer(inputs.mesh, RayScene(inputs.mesh.vertices, inputs.mesh.faces))
+        viewer = SurfaceViewer.of(inputs.mesh)
         self.scenery = {on: set_scenery(viewer, self.sizes, on) for on in (False, True)}
         frames = frames_to_climb(inputs, settings, fitted)
         moves, count = settings.appearance.light_moves(inputs.moves), self.sizes.points

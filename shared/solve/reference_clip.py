@@ -13,7 +13,6 @@ import torch
 from shared.errors import InputError
 from shared.gather import SurfaceViewer
 from shared.io.arrays import load_arrays, save_arrays
-from shared.raycast import RayScene
 from shared.solve.appearance import State
 from shared.solve.capture import set_scenery, spread_frames
 from shared.solve.chart_scale import describe_scale
@@ -89,7 +88,7 @@ def solve_by_reference(
 ) -> InverseResult:
     """As inverse.solve_clip. fitted [F] bool; observe(solver, losses) after each iteration."""
     mesh = inputs.mesh
-    viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
+    viewer = SurfaceViewer.of(mesh)
     index = np.nonzero(fitted)[0]
     some = index[spread_frames(len(index), START_FRAMES)]
     average = average_texture(inputs, viewer, settings.map_size, some, progress)
@@ -160,7 +159,7 @@ def conclude(inputs, settings, solver: ReferenceSolver, average: Average, fitted
     """The solver's state as maps, light and shading, for re-rendering by the shared renderer."""
     surface, material = average.surface, map_material(solver, average)
     moved = inputs.mesh.replace(vertices=solver.vertices().detach().cpu().double().numpy())
-    viewer = SurfaceViewer(moved, RayScene(moved.vertices, moved.faces))
+    viewer = SurfaceViewer.of(moved)
     roughness_map = solver.parameters["roughness"].detach().cpu().numpy()
     skin = average.weight > 1e-3
     roughness = float(np.median(roughness_map.reshape(-1)[surface.pixel][skin]))

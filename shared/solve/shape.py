@@ -15,7 +15,6 @@ import scipy.sparse as sparse
 
 from shared.gather import SurfaceViewer
 from shared.mesh import Mesh, subdivide, vertex_normals
-from shared.raycast import RayScene
 from shared.read_ahead import read_ahead
 from shared.shading import DEEP, Material, VertexShading
 from shared.solve.appearance import Settings
@@ -147,7 +146,7 @@ class ShapeSolver:
         """Looks at the shaped faces' vertices that some frame faces. before: of a coarser level, whose nearest point
         tells what each sees."""
         clip = self.clip
-        viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
+        viewer = SurfaceViewer.of(mesh)
         wanted = np.zeros(len(mesh.vertices), bool)
         wanted[mesh.faces[shaped]] = True
         index = np.nonzero(wanted & face_front(viewer, clip.camera_from_head, 0.2))[0]

@@ -16,7 +16,7 @@ from shared.envmap import cube_from_latlong, latlong_directions, latlong_lookup
 from shared.gather import SurfaceViewer
 from shared.geometry import rigid, world_from_head
 from shared.mesh import Mesh, interpolate, normalised
-from shared.raycast import RayScene, camera_hits
+from shared.raycast import camera_hits
 from shared.render import SurfaceMaps, render_frame
 from shared.shading import DEEP, Material, VertexShading
 from shared.solve.capture import Sizes, face_front, set_scenery
@@ -113,7 +113,7 @@ class HeadViews:
         only: np.ndarray | None = None,
     ):
         self.light_resolution, self.deep = light_resolution, deep
-        self.viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces))
+        self.viewer = SurfaceViewer.of(mesh)
         self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"])
         self.scenery = set_scenery(self.viewer, sizes or Sizes())
         poses = [camera.camera_from_head for camera in cameras]
