@@ -53,13 +53,14 @@ def main() -> int:
 
 def measure(batch: Path, out: Path, cores: int) -> dict:
     """One call of limn on so many cores; its own memory (not its stages') is sampled each second."""
-    temporary = set(os.listdir(tempfile.gettempdir()))
+    temporary = out.with_name(f"{out.name}_temporary")
+    temporary.mkdir()
     command = [sys.executable, "-m", "tools.limn", "run", str(batch), "--out", str(out), "--cores", str(cores), *QUICK]
     allowed = sorted(os.sched_getaffinity(0))[:cores]
     start, engine, whole = time.monotonic(), [], []
     with tempfile.TemporaryFile("w+") as output:
         process = psutil.Popen(["taskset", "-c", ",".join(map(str, allowed)), *command], stdout=output,
-                               stderr=subprocess.STDOUT)
+                               stderr=subprocess.STDOUT, env={**os.environ, "TMPDIR": str(temporary)})
         while process.poll() is None:
             time.sleep(1.0)
             engine.append(sum(own_mb(process)))
@@ -69,7 +70,7 @@ def measure(batch: Path, out: Path, cores: int) -> dict:
         text = output.read()
     growth = growth_mb(np.array(engine))
     left = [path.name for path in out.rglob(".*") if path.name != ".hashes.json"]
-    left += sorted(set(os.listdir(tempfile.gettempdir())) - temporary)
+    left += sorted(path.name for path in temporary.iterdir())
     done = sum(1 for path in out.iterdir() if (path / "export" / "report.html").is_file())
     faults = [f"{cores} cores: exit code {process.returncode}"] * (process.returncode not in (0, 3))
     faults += [f"{cores} cores: memory grows by {growth:.0f} MB"] * (growth > MOST_GROWTH_MB)
