@@ -55,6 +55,17 @@ def project(points: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.nda
     return pixels, depth
 
 
+def projection_slope(points: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """[P, 2, 3]: derivative of the pixels by the points [P, 3] in head space, pose [4, 4]."""
+    in_camera = points @ camera_from_head[:3, :3].T + camera_from_head[:3, 3]
+    depth = in_camera[:, 2:]
+    focal = intrinsics[[0, 1], [0, 1]]
+    slope = np.zeros((len(points), 2, 3))
+    slope[:, 0, 0], slope[:, 1, 1] = focal[0] / depth[:, 0], focal[1] / depth[:, 0]
+    slope[:, :, 2] = -focal * in_camera[:, :2] / depth**2
+    return slope @ camera_from_head[:3, :3]
+
+
 def camera_centres(camera_from_head: np.ndarray) -> np.ndarray:
     """[F, 4, 4] -> [F, 3]: where the camera stands in head space, mm."""
     return invert_rigid(camera_from_head)[..., :3, 3]

@@ -17,7 +17,7 @@ from shared.contract import Job, Output, Parameter, Stage, main
 
 STAGE = Stage(
     name="track_landmarks",
-    version=4,
+    version=5,
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
     given=("landmarks", "poses"),
@@ -25,7 +25,7 @@ STAGE = Stage(
         Output("poses.npz", "camera_from_head [F, 4, 4], covariance [F, 6, 6], frame_index, intrinsics", unit="mm"),
         Output("mesh.npz", "the fitted head with its UVs and face segments", unit="mm", space="head"),
         Output("landmarks.npz", "the 468 landmarks of each used frame", unit="px", space="crop"),
-        Output("tracks.npz", "track points on the skin and their reprojection errors", unit="mm", space="head"),
+        Output("tracks.npz", "track points on the skin, their errors in pixels and in depth", unit="mm", space="head"),
         Output("tracking.json", "residuals, rotation range, excluded frames with their reasons, warnings"),
         Output("overlay.png", "mesh and landmarks drawn over five frames", colour_space="srgb"),
         Output("curves.png", "pose and its uncertainty over time", colour_space="srgb"),
@@ -42,7 +42,7 @@ STAGE = Stage(
         Parameter("window", float, 5.0, "Standard width of the windows that are matched.", "texels", 1.5, 30.0),
         Parameter("point_prior", float, 10.0, "Deviation of track points about the fitted head.", "mm", 0.01, 1000.0),
         Parameter("fit", str, "robust", "Weights of the head fit.", choices=("robust", "published")),
-        Parameter("stiffness", float, 0.25, "Resistance of the free shape correction to bending.", "", 0.01, 1e6),
+        Parameter("stiffness", float, 20.0, "Stiffness of the free shape, per noise over relief.", "", 0.01, 1e6),
         Parameter("least_presence", float, 0.5, "Landmark network's confidence below which a frame is lost.", "", 0, 1),
         Parameter("outlier_factor", float, 4.0, "Frames that fit so many times worse are left out.", "", 1.5, 100.0),
     ),
@@ -202,7 +202,7 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
         frame_index=frames.frame_index[kept],
     )
     residual = np.nanmedian(track.error_px[fits], axis=0)
-    save_arrays(job.out / "tracks.npz", points_head=track.points_head, residual_px=residual)
+    save_arrays(job.out / "tracks.npz", points_head=track.points_head, residual_px=residual, sigma_mm=track.sigma_mm)
     excluded = excluded_frames(frames, used, presence, reasons)
     write_json(job.out / "tracking.json", summarise(job, frames, model, track, fits, excluded))
     chosen = choose_references(poses, 5)

@@ -7,6 +7,7 @@ from toy_head import toy_head
 from shared.geometry import project, rigid, rotation_from_vector
 from shared.mesh import interpolate
 from shared.raycast import RayScene
+from shared.solve.depth_noise import DepthNoise
 from shared.solve.fit_head import FitWeights, fit_codes, fit_surface, landmarks_on_points, triangulate
 
 MODEL = toy_head()
@@ -45,7 +46,8 @@ def test_free_correction_takes_up_what_the_codes_cannot():
     truth = true_head(bump_mm=3.0)
     points, landmarks = observed(truth)
     codes = fit_codes(MODEL, points, landmarks, WEIGHTS)
-    free = fit_surface(MODEL, codes, points, FitWeights(stiffness=0.3))
+    noise = DepthNoise(np.full(len(points), 0.05), 0.05)
+    free = fit_surface(MODEL, codes, points, noise, FitWeights())
     near = np.linalg.norm(truth - [30.0, 20.0, 80.0], axis=1) < 18.0
 
     def distance(vertices):
@@ -55,6 +57,17 @@ def test_free_correction_takes_up_what_the_codes_cannot():
 
     assert distance(free.vertices) < 0.5 * distance(codes.vertices)
     assert distance(free.vertices) < 0.4  # the mesh has a vertex only every 12 mm
+
+
+def test_free_correction_is_stiff_where_depth_is_noise():
+    points, landmarks = observed(true_head(), noise_mm=2.0)
+    codes = fit_codes(MODEL, points, landmarks, WEIGHTS)
+    bent = [
+        np.std(fit_surface(MODEL, codes, points, DepthNoise(np.full(len(points), said), said), FitWeights()).vertices
+               - codes.vertices)
+        for said in (0.05, 2.0)
+    ]
+    assert bent[1] < 0.3 * bent[0]
 
 
 def test_poses_move_with_the_head():

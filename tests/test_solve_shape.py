@@ -9,15 +9,15 @@ from toy_head import toy_head
 
 from shared.envmap import cube_directions
 from shared.gather import SurfaceViewer, prepare_picture
-from shared.geometry import rigid, rotation_from_vector
+from shared.geometry import projection_slope, rigid, rotation_from_vector
 from shared.mesh import Mesh, interpolate, normalised, vertex_normals
 from shared.raycast import RayScene, camera_hits
 from shared.shading import Material, VertexShading
 from shared.solve.appearance import Settings
 from shared.solve.capture import Sizes, set_scenery
 from shared.solve.shape import Reflectance, ShapeClip, ShapeSettings, ShapeSolver
-from shared.solve.shape_equations import EquationSettings
-from shared.solve.shape_samples import projection_slope, tangent_frames
+from shared.solve.shape_equations import EquationSettings, excess
+from shared.solve.shape_samples import tangent_frames
 from shared.solve.shape_step import TrackPoints, large_step_metric, normal_turns
 from shared.solve.shape_terms import Reflections, shading_terms
 from shared.transfer import mesh_points
@@ -151,6 +151,19 @@ def test_irradiance_turns_with_the_normal(toy):
     before = np.einsum("pj,jfc->pfc", upright * shading.transfer.visibility(rows), shading.light_along)
     change = (direct - before) / 0.05
     np.testing.assert_allclose(terms.irradiance_turn[..., 0], change, atol=0.06 * np.abs(change).max())
+
+
+def test_excess_is_one_for_independent_noise_and_grows_with_what_neighbours_share():
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-80.0, 80.0, (6000, 2)), np.zeros(6000)])
+    power = rng.uniform(0.5, 2.0, len(points))
+    independent = np.sqrt(power) * rng.normal(size=len(points))
+    assert 1.0 <= excess(points, independent, power) < 1.15
+    cell = np.unique(np.floor(points / 8.0), axis=0, return_inverse=True)[1].ravel()
+    shared = 0.5 * np.sqrt(power) * rng.normal(size=cell.max() + 1)[cell]
+    in_cell = len(points) / (cell.max() + 1)
+    found = excess(points, independent + shared, power)
+    assert 0.3 * in_cell * 0.25 < found - 1.0 < 1.2 * in_cell * 0.25
 
 
 def test_dent_is_found(toy):

@@ -24,7 +24,7 @@ class ClipInputs:
     """F frames with poses: camera_from_head [F, 4, 4]; intrinsics [3, 3] and size (width, height) of the pictures;
     moves: "head" or "camera"; face_segment [faces] index into segment_names, or None where the mesh has none.
 
-    place [F]: each frame's place in frames; tracks: points [N, 3] on the skin and their errors [N] in pixels, where
+    place [F]: each frame's place in frames; tracks: points [N, 3] on the skin and their errors [N] in depth, mm, where
     mesh and poses are the tracked ones.
     """
 
@@ -83,7 +83,7 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
     names = tuple(read_json(tracked / "tracking.json")["segments"])
     poses = load_arrays(Path(pose_path)) if pose_path else tracked_poses
     points = None if mesh_path or pose_path else load_arrays(tracked / "tracks.npz")
-    tracks = None if points is None else (points["points_head"], points["residual_px"])
+    tracks = None if points is None else (points["points_head"], points["sigma_mm"])
     pose, place = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
     return ClipInputs(mesh, pose, frames.intrinsics, frames.size, frames.moves, frames, place, segment, names, tracks)
 

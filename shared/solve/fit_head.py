@@ -22,6 +22,7 @@ from shared.geometry import project, rotation_from_vector, similarity_from_point
 from shared.head_model import HeadModel
 from shared.mesh import interpolate, uniform_laplacian, vertex_normals
 from shared.raycast import RayScene
+from shared.solve.depth_noise import DepthNoise
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,8 @@ class HeadFit:
 
 EFFECTIVE_TRACKS = 100.0
 SURFACE_REACH_MM = 8.0
+LEAST_RELIEF_MM = 0.3
+"""No head is closer to the model than this."""
 CONTACT_MM, CONTACT_WEIGHT, FACING_COSINE = 2.5, 1.0, -0.5
 APERTURES = np.array(
     [(160, 144), (159, 145), (158, 153), (387, 373), (386, 374), (385, 380), (82, 87), (13, 14), (312, 317)]
@@ -72,12 +75,11 @@ class FitWeights:
     aperture_mm: float = 0.7
     identity: float = 1.0
     expression: float = 0.6
-    stiffness: float = 0.25
+    stiffness: float = 20.0
 
-    def for_depth_noise(self, noise_mm: float) -> FitWeights:
-        """For track points whose depth is uncertain by noise_mm: the model counts more, the surface is stiffer."""
-        track_mm = float(np.hypot(self.track_mm, noise_mm))
-        return replace(self, track_mm=track_mm, stiffness=self.stiffness * (1.0 + (noise_mm / 0.5) ** 2))
+    def for_depth_noise(self, noise: DepthNoise) -> FitWeights:
+        """For track points whose depth is uncertain: the model counts more."""
+        return replace(self, track_mm=float(np.hypot(self.track_mm, noise.of_mean(EFFECTIVE_TRACKS))))
 
 
 PUBLISHED = FitWeights(track_mm=2.8 * (100.0 / 30.0) ** 0.5, landmark_mm=2.8)
@@ -199,20 +201,23 @@ def _closest(vertices, normals, usable, points, reach_mm):
 
 
 def fit_surface(
-    model: HeadModel, fit: HeadFit, points: np.ndarray, weights: FitWeights, iterations: int = 5
+    model: HeadModel, fit: HeadFit, points: np.ndarray, noise: DepthNoise, weights: FitWeights, iterations: int = 5
 ) -> HeadFit:
     """The free correction: vertices move by a thin plate through the track points [N, 3] (track space).
 
     Each point pulls the place on the surface that lies under it along the normal, not the nearest vertex: between
-    vertices a curved surface sags. Lips that the codes have closed stay closed.
+    vertices a curved surface sags. The plate is as stiff as a Wiener filter wants it: by the power of the points'
+    noise over that of what the codes have left. Lips that the codes have closed stay closed, thin walls thin.
     """
     count = len(fit.vertices)
     laplacian = uniform_laplacian(model.faces, count)
     plate = (laplacian.T @ laplacian).tocsr() + 1e-4 * sparse.identity(count)
     contact = CONTACT_WEIGHT * _contact(model, fit.vertices)
     in_head, vertices = fit.to_head(points), fit.vertices
+    variance = float(np.median(fit.scale * noise.sigma)) ** 2
+    final = weights.stiffness * variance / _relief(model, vertices, in_head, fit.scale * noise.single)
     for step in range(iterations):
-        stiffness = weights.stiffness * 4.0 ** (iterations - 1 - step)
+        stiffness = final * 4.0 ** (iterations - 1 - step)
         under = _under(model, vertices, in_head, SURFACE_REACH_MM)
         interpolation = sparse.csr_matrix(
             (under.bary.ravel(), (np.repeat(np.arange(len(under.bary)), 3), model.faces[under.face].ravel())),
@@ -226,16 +231,20 @@ def fit_surface(
     return HeadFit(fit.scale, fit.rotation, fit.translation, fit.identity, fit.expression, vertices)
 
 
+def _relief(model: HeadModel, vertices: np.ndarray, points: np.ndarray, noise_mm: float) -> float:
+    """Mean square of how far the head lies from the surface, mm^2: the points' heights [N, 3] less their noise."""
+    height = 1.4826 * np.median(np.abs(_under(model, vertices, points, SURFACE_REACH_MM).offset))
+    return max(float(height**2 - noise_mm**2), LEAST_RELIEF_MM**2)
+
+
 def _contact(model: HeadModel, vertices: np.ndarray) -> sparse.csr_matrix:
-    """Laplacian [V, V] of the graph that joins facing vertices of the lips closer than CONTACT_MM."""
-    lips = np.unique(model.faces[np.array([name == "lips" for name in model.segment_names])[model.face_segment]])
-    normals = vertex_normals(vertices, model.faces)[lips]
-    pairs = cKDTree(vertices[lips]).query_pairs(CONTACT_MM, output_type="ndarray")
+    """Laplacian [V, V] of the graph that joins vertices closer than CONTACT_MM that face each other or away from each
+    other: lips, and thin walls such as lids before their sockets."""
+    normals = vertex_normals(vertices, model.faces)
+    pairs = cKDTree(vertices).query_pairs(CONTACT_MM, output_type="ndarray")
     pairs = pairs[(normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(1) < FACING_COSINE]
     rows = np.repeat(np.arange(len(pairs)), 2)
-    joined = sparse.csr_matrix(
-        (np.tile([1.0, -1.0], len(pairs)), (rows, lips[pairs].ravel())), (len(pairs), len(vertices))
-    )
+    joined = sparse.csr_matrix((np.tile([1.0, -1.0], len(pairs)), (rows, pairs.ravel())), (len(pairs), len(vertices)))
     return joined.T @ joined
 
 

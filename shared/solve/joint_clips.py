@@ -21,12 +21,12 @@ from shared.geometry import (
     Similarity,
     camera_centres,
     project,
+    projection_slope,
     rotation_from_vector,
     similarity_from_points,
 )
 from shared.mesh import Mesh, normalised
 from shared.solve.reshape import track_points
-from shared.solve.shape_samples import projection_slope
 from shared.texture_match import Matches, MeanTexture, match_textures
 
 MATCHES, LEAST_MATCHES = 2000, 300
@@ -147,7 +147,7 @@ def fit_similarity(
 
 def depth_deviation(clip) -> float:
     """Median standard deviation of a clip's track points in depth, mm."""
-    return float(np.median(track_points(*clip.tracks, clip.camera_from_head, clip.intrinsics).sigma_mm))
+    return float(np.median(track_points(*clip.tracks).sigma_mm))
 
 
 @dataclass(frozen=True)

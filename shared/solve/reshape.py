@@ -7,9 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import cKDTree
 
-from shared.geometry import camera_centres
 from shared.intersections import move_without_crossing
-from shared.mesh import Mesh, normalised, subdivide
+from shared.mesh import Mesh, subdivide
 from shared.solve.appearance import Settings
 from shared.solve.capture import Sizes, lens_of_frames
 from shared.solve.shape import HELD, SHAPED, Reflectance, ShapeClip, ShapeSettings, ShapeSolver
@@ -54,16 +53,9 @@ def faces_of(inputs, names: tuple[str, ...]) -> np.ndarray:
     return np.isin(inputs.face_segment, wanted)
 
 
-def track_points(
-    positions: np.ndarray, residual_px: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray
-) -> TrackPoints:
-    """Track points [N, 3] with the depth's standard deviation that their errors [N] and the clip's parallax leave."""
-    directions = normalised(camera_centres(camera_from_head))
-    half_angle = 0.5 * np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0))
-    px_per_mm = np.median(intrinsics[..., 0, 0]) / np.median(camera_from_head[:, 2, 3])
-    depth = residual_px / px_per_mm / max(np.sin(half_angle), 0.01)
-    known = np.isfinite(depth)
-    return TrackPoints(positions[known], np.hypot(TRACK_FLOOR_MM, depth[known]))
+def track_points(positions: np.ndarray, sigma_mm: np.ndarray) -> TrackPoints:
+    """Track points [N, 3] with the standard deviation of their depth [N]."""
+    return TrackPoints(positions, np.hypot(TRACK_FLOOR_MM, sigma_mm))
 
 
 def meet_outline(inputs, frames: tuple[np.ndarray, np.ndarray], settings: RimSettings, note: Callable):
@@ -102,7 +94,7 @@ def reshape(
     chosen, fitted = frames
     tracks = None
     if inputs.tracks is not None:
-        tracks = track_points(*inputs.tracks, inputs.camera_from_head, inputs.intrinsics)
+        tracks = track_points(*inputs.tracks)
     clip = ShapeClip(
         lambda i: inputs.picture(int(chosen[i])),
         inputs.camera_from_head[chosen],

@@ -39,8 +39,6 @@ from shared.transfer import Nodes, Points, Transfer, mesh_points, nearest_points
 SHAPED = ("forehead", "brows", "lids", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "lips", "chin", "jaw")
 """Segments whose samples shape the surface. Ears, neck and scalp follow them; what HELD names stays the model's."""
 HELD = ("eyes", "inner_mouth", "eye_sockets")
-RESOLVED_PX = 2.0
-"""Vertices closer than this see the same of a picture: lenses and codecs resolve no single pixel."""
 MINIMUM_FRAMES, FEWEST_POINTS = 4, 50
 BLUR_EDGES = 0.4
 """Standard width of the pictures' blur over the typical edge: what a vertex stands for."""
@@ -181,7 +179,6 @@ class ShapeSolver:
         samples = samples.points(rows)
         terms = shading_terms(shading, rows, traced.reflections)
         points = points.take(rows)
-        spacing_px = typical_edge(mesh.vertices, mesh.faces[shaped]) * pixels_per_mm(clip)
         equations = point_equations(
             samples,
             terms,
@@ -190,7 +187,6 @@ class ShapeSolver:
             self.reflectance.specular,
             clip.fitted,
             settings.equations,
-            share=min(1.0, (spacing_px / RESOLVED_PX) ** 2),
         )
         return Surface(mesh, index[rows], terms.tangents, equations)
 
@@ -266,11 +262,6 @@ class ShapeSolver:
                 break
             surface = moved
         return surface.mesh
-
-
-def pixels_per_mm(clip: ShapeClip) -> float:
-    """At the head's distance in the middle of the clip's frames."""
-    return float(np.median(clip.intrinsics[..., 0, 0]) / np.median(clip.camera_from_head[:, 2, 3]))
 
 
 def typical_edge(vertices: np.ndarray, faces: np.ndarray) -> float:

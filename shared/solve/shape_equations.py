@@ -8,7 +8,9 @@ residual of channel c in frame f, r = a E + s S - I, changes by
 
 with the albedo a eliminated per point and channel (variable projection), so that only what changes from frame to frame
 counts and no texture can pass for relief. Errors of light, bounces and pose are smooth over the face: the part of the
-residuals that is smooth in each frame is laid to them, relative to the modelled radiance.
+residuals that is smooth in each frame is laid to them, relative to the modelled radiance. A motion across the parallax
+is none that a place could cause: by how much the samples speak for it louder than their noise allows, all of them count
+less.
 """
 
 from __future__ import annotations
@@ -20,12 +22,14 @@ import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
 from shared.gather import satisfied
+from shared.solve.depth_noise import PATCH_MM
 from shared.solve.shape_samples import SurfaceSamples
 from shared.solve.shape_terms import ShadingTerms
 from shared.transfer import spread_vertices
 
 MINIMUM_ALBEDO, MAXIMUM_ALBEDO, TYPICAL_ALBEDO = 0.003, 1.0, 0.3
 CAUCHY_SCALE = 2.5
+PATCHES, CHI_SQUARED_MEDIAN_1 = 1000, 0.455
 LARGEST_SQUARED_ERROR = 0.01
 """A sample that is off by more than a tenth of full scale shows something else than the surface."""
 
@@ -69,12 +73,10 @@ class SmoothField:
 
 @dataclass(frozen=True)
 class EquationSettings:
-    """noise: absolute and relative standard deviation of a sample; correlated: how many samples count as one
-    independent; smooth_mm: width over which residuals are laid to light and pose, 0: none are; shadow_mm: how far off
-    the borders of cast shadows may be."""
+    """noise: absolute and relative standard deviation of a sample; smooth_mm: width over which residuals are laid to
+    light and pose, 0: none are; shadow_mm: how far off the borders of cast shadows may be."""
 
     noise: tuple[float, float] = (0.006, 0.03)
-    correlated: float = 5.0
     smooth_mm: float = 12.0
     shadow_mm: float = 2.5
 
@@ -87,10 +89,8 @@ def point_equations(
     specular: float | np.ndarray,
     fitted: np.ndarray,
     settings: EquationSettings,
-    share: float = 1.0,
 ) -> PointEquations:
-    """Equations of P points [P, 3] with normals [P, 3]; specular: intensity, one or [P]; fitted [F] bool; share: how
-    many independent points one counts as, where they are denser than the pictures resolve."""
+    """Equations of P points [P, 3] with normals [P, 3]; specular: intensity, one or [P]; fitted [F] bool."""
     specular = np.broadcast_to(np.asarray(specular, np.float32), (len(points),))[:, None, None]
     gloss = specular * terms.reflection
     doubt = settings.shadow_mm * terms.shadow_slope
@@ -111,13 +111,27 @@ def point_equations(
     weighted = weight * terms.irradiance
     slopes -= terms.irradiance[..., None] * ((weighted[..., None] * slopes).sum(1) / power[..., None])[:, None]
     error -= terms.irradiance * ((weighted * error).sum(1) / power)[:, None]
-    misfit = max(1.0, float((weight * error**2).sum((1, 2)).sum() / max((weight > 0).sum(), 1)))
-    evidence = np.float64(share / (misfit * settings.correlated))
+    across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
+    null = -np.einsum("pfci,pfi->pfc", samples.gradient.astype(np.float32), across)
+    null -= terms.irradiance * ((weighted * null).sum(1) / power)[:, None]
+    evidence = np.float64(1.0 / excess(points, (weight * null * error).sum((1, 2)), (weight * null**2).sum((1, 2))))
     rows = slopes.reshape(len(slopes), -1, 3)
     scaled = rows * (evidence * weight).reshape(len(slopes), -1, 1)
     hessian = np.swapaxes(scaled, 1, 2) @ rows
     gradient = (scaled * error.reshape(len(slopes), -1, 1)).sum(1)
     return PointEquations(hessian.astype(np.float64), gradient.astype(np.float64), albedo, *rms)
+
+
+def excess(points: np.ndarray, slope: np.ndarray, power: np.ndarray, radius_mm: float = PATCH_MM) -> float:
+    """How many times larger the errors of patches are than their samples' noise: at least 1.
+
+    points [P, 3]; slope, power [P]: gradient and Hessian of the cost by a quantity that is known to be zero everywhere.
+    Their sums over a patch, g and H, give g^2 / H, chi-squared with one degree of freedom; its median counts.
+    """
+    centres = points[spread_vertices(points, min(PATCHES, len(points)))]
+    near = cKDTree(points).query_ball_point(centres, radius_mm)
+    squared = [slope[patch].sum() ** 2 / max(power[patch].sum(), 1e-12) for patch in near]
+    return max(1.0, float(np.median(squared)) / CHI_SQUARED_MEDIAN_1)
 
 
 def _fit_albedo(samples, irradiance, gloss, fitted, noise, doubt) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from shared.gather import Picture, SurfaceViewer, remap, sample_inside, sample_limits
-from shared.geometry import project
+from shared.geometry import project, projection_slope
 from shared.mesh import normalised
 
 LEAST_BLUR_PX = 0.3
@@ -46,17 +46,6 @@ def tangent_frames(normals: np.ndarray) -> np.ndarray:
     axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
     first = normalised(np.cross(normals, axis))
     return np.stack([first, np.cross(normals, first)], axis=1)
-
-
-def projection_slope(points: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """[P, 2, 3]: derivative of the pixels by the points [P, 3] in head space, pose [4, 4]."""
-    in_camera = points @ camera_from_head[:3, :3].T + camera_from_head[:3, 3]
-    depth = in_camera[:, 2:]
-    focal = intrinsics[[0, 1], [0, 1]]
-    slope = np.zeros((len(points), 2, 3))
-    slope[:, 0, 0], slope[:, 1, 1] = focal[0] / depth[:, 0], focal[1] / depth[:, 0]
-    slope[:, :, 2] = -focal * in_camera[:, :2] / depth**2
-    return slope @ camera_from_head[:3, :3]
 
 
 @dataclass(frozen=True)

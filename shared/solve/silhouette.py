@@ -20,10 +20,9 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
 from shared.gather import remap
-from shared.geometry import project
+from shared.geometry import project, projection_slope
 from shared.mesh import Mesh, loop_subdivision, mesh_edges, normalised, vertex_normals
 from shared.raycast import RayScene
-from shared.solve.shape_samples import projection_slope
 from shared.solve.shape_step import large_step_metric
 
 CAUCHY_SCALE, FARTHEST_SIGMAS = 2.5, 8.0

@@ -11,11 +11,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from shared.bundle import BundleSolution, place_points, zoomed
+from shared.bundle import place_points, zoomed
 from shared.bundle_problem import Tracks
 from shared.geometry import camera_centres, project, rigid
 from shared.head_model import HeadModel
 from shared.mesh import normalised
+from shared.solve.depth_noise import DepthNoise, depth_noise
 from shared.solve.first_poses import (
     LOSS,
     Adjusted,
@@ -62,7 +63,8 @@ class TrackSettings:
 class HeadTrack:
     """The result: poses [F, 4, 4] and covariance [F, 6, 6] of all F frames given, the fitted head, the track points.
 
-    error_px [F, N]: reprojection error of each track point, NaN where not seen; reliable [F]: enough tracks.
+    sigma_mm [N]: how far each may be off in depth, see shared.solve.depth_noise. error_px [F, N]: reprojection error of
+    each track point, NaN where not seen; reliable [F]: enough tracks.
     noise_factor: see shared.solve.pose_trust. focal_gain, focal_deviation: the focal length over the given one had it
     been solved, and the deviation of its logarithm; focal_solved: the result belongs to the solved one. held_out_px:
     median error of tracks kept aside, under the poses before and after the last fine pass.
@@ -72,6 +74,7 @@ class HeadTrack:
     covariance: np.ndarray
     fit: HeadFit
     points_head: np.ndarray
+    sigma_mm: np.ndarray
     error_px: np.ndarray
     reliable: np.ndarray
     noise_factor: float
@@ -91,10 +94,10 @@ def track_head(
     note(f"landmarks: {posed.sum()} of {len(posed)} frames with a pose, {np.nanmedian(start.error_px):.2f} px")
     found = flow_over_landmarks(few, start, posed, settings.flow, progress)
     note(_summary("flow over landmarks", found))
-    found = flow_over_head(few, model, _fit(few, model, found, settings), found, settings.flow, progress)
+    found = flow_over_head(few, model, _fit(few, model, found, settings)[0], found, settings.flow, progress)
     note(_summary("flow over the head", found))
 
-    fit = _fit(few, model, found, settings)
+    fit, _ = _fit(few, model, found, settings)
     poses, known = _onto_all(clip, model, chosen, fit, found)
     found = _texture_pass(clip, model, fit, poses, known, coarse_pass(clip.face_width_px), progress)
     note(_summary("tracks", found))
@@ -102,7 +105,7 @@ def track_head(
         settings.texel_px, True, settings.tracks, Windows(sigma=settings.window_sigma), settings.prior_mm
     )
     for _ in range(settings.fine_passes):
-        fit = _fit(clip, model, found, settings)
+        fit, _ = _fit(clip, model, found, settings)
         before = fit.camera_from_head(found.solution.camera_from_points)
         finer, aside = _fine_pass(clip, model, fit, before, found.reliable, fine, progress)
         note(_summary("fine tracks", finer))
@@ -115,13 +118,16 @@ def track_head(
     found = trusted.adjusted
     note(f"noise factor {trusted.noise_factor:.2f}, focal length {trusted.focal_gain:.4f} of the given one")
     lens = zoomed(clip.intrinsics, trusted.focal_gain if trusted.focal_solved else 1.0)
-    fit = _fit(replace(clip, intrinsics=lens), model, found, settings, trusted.noise_factor)
+    fit, noise = _fit(replace(clip, intrinsics=lens), model, found, settings)
+    note(f"depth of a track point: {fit.scale * noise.single:.2f} mm, with what neighbours share "
+         f"{fit.scale * np.median(noise.sigma):.2f} mm")
     unit = np.r_[1.0, 1.0, 1.0, np.full(3, fit.scale)]
     return HeadTrack(
         camera_from_head=fit.camera_from_head(found.solution.camera_from_points),
         covariance=trusted.covariance * np.outer(unit, unit),
         fit=fit,
         points_head=fit.to_head(found.solution.points),
+        sigma_mm=fit.scale * noise.sigma,
         error_px=found.solution.error_px,
         reliable=found.reliable,
         noise_factor=trusted.noise_factor,
@@ -205,11 +211,8 @@ def _summary(label: str, found: Adjusted) -> str:
     return f"{label}: {len(found.solution.points)} tracks, {error:.3f} px median, {found.reliable.sum()} frames"
 
 
-def _fit(clip, model, found: Adjusted, settings, noise_factor: float = 1.0) -> HeadFit:
-    """Codes, then the free correction, to track points and to the landmarks as they lie among them.
-
-    noise_factor: by how much the tracks' noise is larger than it looks, where that is known.
-    """
+def _fit(clip, model, found: Adjusted, settings) -> tuple[HeadFit, DepthNoise]:
+    """Codes, then the free correction, to track points and to the landmarks as they lie among them."""
     solution, reliable = found.solution, found.reliable
     poses = solution.camera_from_points[reliable]
     directions = normalised(camera_centres(poses))
@@ -217,16 +220,7 @@ def _fit(clip, model, found: Adjusted, settings, noise_factor: float = 1.0) -> H
     landmarks = landmarks_on_points(
         clip.landmarks_px[reliable][central], poses[central], solution.points, clip.intrinsics
     )
-    # errors that frames share do not average out over a track
-    shared = max(1.0, noise_factor / np.sqrt(np.median(np.isfinite(solution.error_px).sum(0))))
-    weights = settings.fit.for_depth_noise(shared * _depth_noise_mm(solution, poses, clip.intrinsics))
+    noise = depth_noise(solution, reliable, clip.intrinsics)
+    weights = settings.fit.for_depth_noise(noise)
     fit = fit_codes(model, solution.points, landmarks, weights)
-    return fit_surface(model, fit, solution.points, weights)
-
-
-def _depth_noise_mm(solution: BundleSolution, poses: np.ndarray, intrinsics: np.ndarray) -> float:
-    """How far a track's typical error moves a point in depth, given the clip's rotation (half of the widest angle)."""
-    directions = normalised(camera_centres(poses))
-    half_angle = 0.5 * np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0))
-    error_mm = np.nanmedian(solution.error_px) * np.median(poses[:, 2, 3]) / intrinsics[0, 0]
-    return float(error_mm / max(np.sin(half_angle), 0.01))
+    return fit_surface(model, fit, solution.points, noise, weights), noise
