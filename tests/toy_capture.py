@@ -13,7 +13,8 @@ from shared.lobes import LobeTable, specular_reflection
 from shared.mesh import normalised
 from shared.raycast import RayScene
 from shared.shading import light_along
-from shared.solve.appearance import AppearanceSolver, Capture, Settings
+from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.capture import Capture
 from shared.transfer import bounce_nodes, irradiance, mesh_points, node_radiosity, trace_transfer
 
 FRAMES, ROUGHNESS, SPECULAR, NOISE = 14, 0.4, 0.7, 0.002

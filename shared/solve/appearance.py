@@ -22,19 +22,17 @@ import numpy as np
 import torch
 
 from shared.brdf import hemispherical_albedo
-from shared.gather import Samples, satisfied
 from shared.lobes import LobeTable, specular_tables
-from shared.solve.chart_scale import ChartStatement
+from shared.solve.capture import Capture
 from shared.solve.light import FrameLight, LightPriors
 from shared.solve.light_models import LightModel, make_light_model
+from shared.solve.sample_errors import SampleErrors
 from shared.solve.scale import Highlights, most_likely_irradiance
-from shared.transfer import Nodes, Points, Transfer, nearest_points, node_radiosity
+from shared.transfer import nearest_points, node_radiosity
 
 MINIMUM_ALBEDO, MAXIMUM_ALBEDO = 0.003, 1.0
 ALBEDO_PULL = 25.0
 """Precision of the prior on a point's albedo: a standard deviation of 0.2."""
-CAUCHY = 6.0
-"""Squared errors of so many times their spread get half the weight of small ones."""
 
 
 @dataclass(frozen=True)
@@ -70,40 +68,6 @@ class Settings:
         return ("cubemap", self.resolutions[0]), (self.light_model, self.resolutions[-1])
 
 
-@dataclass(frozen=True)
-class Capture:
-    """What the solver looks at: P points seen in F frames.
-
-    points [P] with samples [P, F] and transfer; nodes and their own transfer; directions [J, 3];
-    world_from_head [F, 3, 3]; fitted [F] bool (the other frames are held out); skin [P] bool: where the prior on skin
-    reflectance applies; chart: what a colour chart says about the light's scale; light_index [F]: which of several
-    lights each frame stands in, None: there is one.
-    """
-
-    points: Points
-    samples: Samples
-    transfer: Transfer
-    nodes: Nodes
-    node_transfer: Transfer
-    directions: np.ndarray
-    world_from_head: np.ndarray
-    fitted: np.ndarray
-    skin: np.ndarray
-    chart: ChartStatement | None = None
-    light_index: np.ndarray | None = None
-
-    @property
-    def frames_of_lights(self) -> list[np.ndarray]:
-        """Of each light, the indices of its frames."""
-        return frames_of_lights(self.light_index, len(self.world_from_head))
-
-
-def frames_of_lights(light_index: np.ndarray | None, count: int) -> list[np.ndarray]:
-    """Of each light, the indices of its frames out of count; light_index [count]: each frame's light, None: one."""
-    index = np.zeros(count, int) if light_index is None else light_index
-    return [np.nonzero(index == light)[0] for light in range(int(index.max(initial=0)) + 1)]
-
-
 @dataclass
 class State:
     """The light's parameters [M, 3] and the model they belong to, specular intensity, roughness, albedo [P, 3],
@@ -122,29 +86,17 @@ class State:
         return self.light_model.radiance(self.params)
 
 
-def _channel_first(array: np.ndarray) -> torch.Tensor:
-    """[P, F, 3] -> contiguous [3, P, F]."""
-    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(array, -1, 0)))
-
-
-class AppearanceSolver:
-    """Fits State to a Capture. Tensors inside are channel first: [3, P, F]."""
+class AppearanceSolver(SampleErrors):
+    """Fits State to a Capture, by the errors of its samples. Tensors inside are channel first: [3, P, F]."""
 
     def __init__(self, capture: Capture, settings: Settings):
         self.capture, self.settings = capture, settings
-        samples = capture.samples
-        self.colours = _channel_first(samples.colours)
-        self.limits = _channel_first(samples.limits)
-        self.trust = torch.from_numpy(samples.weight)[None]
-        sigma = settings.noise[0] + settings.noise[1] * self.colours
-        self.precision = 1.0 / (sigma * sigma)
-        self.fitted = torch.from_numpy(capture.fitted.astype(np.float32))
-        self.light_frames = capture.frames_of_lights
-        self.reliability, self.prior_shares = torch.ones(1, 1, 1), None
+        frames, noise = capture.frames_of_lights, settings.noise
+        super().__init__(capture.samples, capture.fitted, frames, noise, settings.independent)
         self.table = LobeTable(capture.points.normals, capture.transfer.visibility(), capture.directions)
         self.node_to_point = nearest_points(capture.nodes.points, capture.points)
         self.direct = torch.from_numpy(capture.transfer.direct.astype(np.float32))
-        self.trust_highlights, self.misfit = False, 1.0
+        self.trust_highlights, self.prior_shares = False, None
         self.lobes: torch.Tensor | None = None
         self.state = self._start()
         self.set_light(settings.light_schedule[0])
@@ -207,9 +159,17 @@ class AppearanceSolver:
         part.table = LobeTable(part.capture.points.normals, part.capture.transfer.visibility(), self.capture.directions)
         return part
 
+    def weigh(self, reliability: torch.Tensor) -> None:
+        """As SampleErrors.weigh; the prior of a light steps back as its samples do."""
+        super().weigh(reliability)
+        used = self.trust.expand_as(reliability)
+        self.prior_shares = [float((used * reliability)[..., own].sum() / used[..., own].sum())
+                             for own in self.light_frames]
+        self.state.light_model.shares = self.prior_shares
+
     # ------------------------------------------------------------------ forward model
     def bake(self) -> None:
-        """Transfer with all diffuse bounces for the present albedo [3, P, J], and the lobes for the roughness."""
+        """Transfer with all diffuse bounces for the present albedo [3, P, J]."""
         self.baked = self.direct[None].expand(3, -1, -1)
         if self.settings.bounce:
             returned = self.state.specular * hemispherical_albedo(round(self.state.roughness, 3))
@@ -271,50 +231,11 @@ class AppearanceSolver:
         return torch.log(torch.stack(own) / mean).double().numpy()
 
     # ------------------------------------------------------------------ eliminated unknowns
-    def weights(self, model: torch.Tensor | None) -> torch.Tensor:
-        """[3, P, F] inverse variances: trust, robust loss, and zero where a censored sample is satisfied."""
-        weight = self.trust * self.precision
-        if model is None:
-            return weight * (self.limits == 0)
-        error, silent = self.errors(model)
-        return weight * (~silent) / (1.0 + error / (CAUCHY * self.spread(error, silent)))
-
-    def errors(self, model: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Squared errors over the assumed noise's variance, and where a censored sample is satisfied; [3, P, F]."""
-        error = model - self.colours
-        return error.square() * self.precision, satisfied(self.limits, error)
-
-    def spread(self, error: torch.Tensor, silent: torch.Tensor, frames: slice | np.ndarray = slice(None)) -> float:
-        """Variance of the errors over the assumed noise's, by their median, in all frames or in some."""
-        used = ((self.trust > 0) & ~silent)[..., frames]
-        return max(float(error[..., frames][used].median()), 0.05) / 0.4549
-
-    def weigh(self, reliability: torch.Tensor) -> None:
-        """How much samples of several lights count against each other, [3, P, F]: 1 in full. A light's prior steps back
-        as its samples do."""
-        self.precision = self.precision * (reliability / self.reliability)
-        self.reliability = reliability
-        used = self.trust.expand_as(reliability)
-        self.prior_shares = [float((used * reliability)[..., own].sum() / used[..., own].sum())
-                             for own in self.light_frames]
-        self.state.light_model.shares = self.prior_shares
-
-    def loss(self, model: torch.Tensor, spread: float | None = None) -> tuple[float, float]:
-        """Mean Cauchy loss of the fitted samples, of errors of this spread (None: their own), and that spread.
-
-        What the steps lower: unlike a mean square it does not rise when many samples fit better and a few worse.
-        """
-        error, silent = self.errors(model)
-        spread = self.spread(error, silent) if spread is None else spread
-        weight = self.trust * self.fitted
-        loss = torch.log1p(error * (~silent) / (CAUCHY * spread))
-        return float((weight * loss).sum() / (3.0 * weight.sum())), spread
-
     def eliminate(self, irradiance, reflection, weight, specular: float | None = None) -> torch.Tensor:
         """Albedo [3, P, 1] that fits best given light and specular intensity (the state's when None), from the
         fitted frames.
 
-        A weak pull to the skin's mean albedo decides where no sample says anything.
+        A weak pull to the skin's typical albedo decides where no sample says anything.
         """
         weight = weight * self.fitted
         specular = self.state.specular if specular is None else specular
@@ -346,35 +267,3 @@ class AppearanceSolver:
         share = (weight * self.colours).sum((1, 2)) / (weight * reflection).sum((1, 2))
         intensity = (moment / curvature.clamp_min(1e-12)).double().numpy()
         return Highlights(intensity, curvature.double().numpy() * self.evidence(weight), share.double().numpy())
-
-    def evidence(self, weight: torch.Tensor) -> float:
-        """Scales the data term so that each light's samples count as settings.independent ones of the variance found.
-        """
-        count = float((weight * self.fitted > 0).sum()) / 3.0
-        return len(self.light_frames) * self.settings.independent / (max(count, 1.0) * self.misfit)
-
-    def measure_misfit(self, model: torch.Tensor, weight: torch.Tensor) -> None:
-        """Variance of the residuals over the assumed noise's, at least 1: where the model cannot follow the clip, the
-        samples say that much less against the priors."""
-        used = weight * self.fitted
-        squared = float((used * (model - self.colours).square()).sum()) / max(float((used > 0).sum()), 1.0)
-        self.misfit = max(1.0, squared)
-
-    def residuals(self, model: torch.Tensor) -> tuple[float, float]:
-        """Root mean square residual (linear, trust-weighted, censored) on fitted and on held-out frames, of the mean
-        over the lights."""
-        squared = (model - self.colours).square() * (~self.errors(model)[1])
-        result = []
-        for chosen in (self.fitted, 1.0 - self.fitted):
-            weight = self.trust * chosen
-            means = [(weight * squared)[..., own].sum() / (3.0 * weight[..., own].sum()).clamp_min(1e-9)
-                     for own in self.light_frames]
-            result.append(float((sum(means) / len(means)).sqrt()))
-        return result[0], result[1]
-
-    def frame_errors(self, model: torch.Tensor) -> np.ndarray:
-        """[F] mean absolute residual of each frame, weighted and censored likewise: unlike a mean square not ruled by
-        the few samples that a wrong shape or a shadow's edge spoils."""
-        error = (model - self.colours).abs() * (~self.errors(model)[1])
-        total = (3.0 * self.trust.sum((0, 1))).clamp_min(1e-9)
-        return ((self.trust * error).sum((0, 1)) / total).double().numpy()

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.gather import Picture, SurfaceViewer, gather_samples
+from shared.gather import Picture, Samples, SurfaceViewer, gather_samples
 from shared.geometry import fibonacci_sphere, world_from_head
 from shared.raycast import RayScene
 from shared.shading import DEEP
-from shared.solve.appearance import Capture, frames_of_lights
+from shared.solve.chart_scale import ChartStatement
 from shared.transfer import (
     Nodes,
     Points,
@@ -50,6 +50,40 @@ class Scenery:
         return trace_transfer(
             self.scene, points, self.nodes, self.directions, progress=progress, visibility=self.visibility
         )
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What the solver looks at: P points seen in F frames.
+
+    points [P] with samples [P, F] and transfer; nodes and their own transfer; directions [J, 3];
+    world_from_head [F, 3, 3]; fitted [F] bool (the other frames are held out); skin [P] bool: where the prior on skin
+    reflectance applies; chart: what a colour chart says about the light's scale; light_index [F]: which of several
+    lights each frame stands in, None: there is one.
+    """
+
+    points: Points
+    samples: Samples
+    transfer: Transfer
+    nodes: Nodes
+    node_transfer: Transfer
+    directions: np.ndarray
+    world_from_head: np.ndarray
+    fitted: np.ndarray
+    skin: np.ndarray
+    chart: ChartStatement | None = None
+    light_index: np.ndarray | None = None
+
+    @property
+    def frames_of_lights(self) -> list[np.ndarray]:
+        """Of each light, the indices of its frames."""
+        return frames_of_lights(self.light_index, len(self.world_from_head))
+
+
+def frames_of_lights(light_index: np.ndarray | None, count: int) -> list[np.ndarray]:
+    """Of each light, the indices of its frames out of count; light_index [count]: each frame's light, None: one."""
+    index = np.zeros(count, int) if light_index is None else light_index
+    return [np.nonzero(index == light)[0] for light in range(int(index.max(initial=0)) + 1)]
 
 
 def set_scenery(viewer: SurfaceViewer, sizes: Sizes, visibility: bool = True) -> Scenery:

@@ -18,7 +18,8 @@ import torch
 
 from shared.color import LUMINANCE
 from shared.mesh import normalised
-from shared.solve.appearance import AppearanceSolver, Capture, Settings
+from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.capture import Capture
 from shared.solve.fit_appearance import Solution
 from shared.solve.scale import scale_prior
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from shared.solve.appearance import AppearanceSolver, Capture, Settings, State
+from shared.solve.appearance import AppearanceSolver, Settings, State
+from shared.solve.capture import Capture
 from shared.solve.light_step import LightStep
 from shared.solve.light_trust import weigh_samples
 from shared.solve.local_roughness import ROUGHNESS_RANGE, GlossEquations, local_roughness

@@ -13,8 +13,9 @@ from shared.gather import Picture, SurfaceViewer
 from shared.mesh import Mesh
 from shared.read_ahead import read_ahead
 from shared.shading import Material, VertexShading
-from shared.solve.appearance import Capture, Settings
+from shared.solve.appearance import Settings
 from shared.solve.capture import (
+    Capture,
     Scenery,
     Sizes,
     build_capture,

@@ -26,7 +26,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shared.solve.appearance import AppearanceSolver, Capture, Settings
+from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.capture import Capture
 from shared.solve.fit_appearance import Solution, fit_appearance
 
 LIGHTS = {

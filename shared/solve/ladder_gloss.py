@@ -15,7 +15,8 @@ import torch
 from scipy.spatial import cKDTree
 
 from shared.mesh import Mesh
-from shared.solve.appearance import AppearanceSolver, Capture, Settings
+from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.capture import Capture
 from shared.solve.fit_appearance import Solution
 from shared.solve.ladder import LOOK_AHEAD, Trial, describe, serves
 from shared.solve.local_roughness import GlossEquations, gloss_equations

@@ -10,8 +10,7 @@ import numpy as np
 from shared.gather import Picture, SurfaceViewer, satisfied
 from shared.read_ahead import read_ahead
 from shared.shading import VertexShading
-from shared.solve.appearance import frames_of_lights
-from shared.solve.capture import spread_frames
+from shared.solve.capture import frames_of_lights, spread_frames
 from shared.solve.texture import (
     IRRADIANCE_ERROR,
     NORMAL_ERROR,
