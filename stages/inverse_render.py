@@ -141,7 +141,7 @@ def read_settings(job: Job, checkpoint=None):
     """The stage's parameters as the solver's settings; checkpoint: the reference solver's own file, or None."""
     from shared.solve.appearance import Settings
     from shared.solve.capture import Sizes
-    from shared.solve.inverse import InverseSettings
+    from shared.solve.inverse_problem import InverseSettings
     from shared.solve.light import LightPriors
     from shared.solve.shape import ShapeSettings
 
@@ -287,7 +287,7 @@ def write_shape(job: Job, inputs, mesh) -> None:
     from shared.io.images import write_png
     from shared.io.meshes import save_mesh
     from shared.shape_pictures import shape_sheet
-    from shared.solve.inverse import FACE_SKIN
+    from shared.solve.inverse_problem import FACE_SKIN
     from shared.solve.reshape import Reshaped, faces_of, segments_of, subdivided_to
 
     segment = segments_of(inputs, mesh)

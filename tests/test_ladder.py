@@ -23,7 +23,7 @@ from shared.report.model_sections import climbed_table
 from shared.solve import ladder_clip
 from shared.solve.appearance import Settings
 from shared.solve.fit_appearance import Solution
-from shared.solve.inverse import InverseSettings
+from shared.solve.inverse_problem import InverseSettings
 from shared.solve.ladder import LIGHTS, Ladder, Model, Trial, allowed_rungs, gain, serves
 from shared.solve.ladder_clip import climb
 from shared.solve.ladder_gloss import VARIATIONS, Gloss, GlossLadder, segments_at

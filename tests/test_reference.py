@@ -12,7 +12,8 @@ from shared.errors import InputError
 from shared.gather import SurfaceViewer
 from shared.solve.capture import Sizes
 from shared.solve.frame_choice import covering_frames
-from shared.solve.inverse import InverseSettings, frames_to_fit, solve_clip, summarise
+from shared.solve.inverse import solve_clip, summarise
+from shared.solve.inverse_problem import InverseSettings, frames_to_fit
 from shared.solve.reference import ReferenceSolver
 from shared.solve.reference_clip import Checkpoint
 from shared.solve.reference_settings import ReferenceSettings

@@ -37,7 +37,8 @@ from shared.io.meshes import read_obj
 from shared.mesh import Mesh, interpolate
 from shared.raycast import RayScene, camera_hits
 from shared.render import SurfaceMaps, render_frame
-from shared.solve.inverse import InverseResult, solve_clip
+from shared.solve.inverse import solve_clip
+from shared.solve.inverse_problem import InverseResult
 from shared.solve.joint_clips import join_clips
 from shared.texture import sample_bilinear
 from shared.texture_match import MeanTexture

@@ -27,7 +27,8 @@ from shared.geometry import fibonacci_sphere
 from shared.io.clip_inputs import ClipInputs, read_inputs
 from shared.lobes import LobeTable, specular_tables
 from shared.solve.fit_appearance import Solution
-from shared.solve.inverse import frames_to_fit, solve_light
+from shared.solve.inverse_problem import frames_to_fit
+from shared.solve.light_and_mesh import solve_light
 from tools.bench_appearance import settings_of, silent
 
 LEAST = {"visibility": False, "specular": False, "light_model": "harmonics_2"}

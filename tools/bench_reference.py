@@ -25,7 +25,8 @@ from pathlib import Path
 import numpy as np
 
 from shared.gather import SurfaceViewer
-from shared.solve.inverse import frames_to_fit, solve_clip
+from shared.solve.inverse import solve_clip
+from shared.solve.inverse_problem import frames_to_fit
 from shared.solve.reference import ReferenceSolver
 from shared.solve.reference_clip import solve_by_reference
 from tools.bench_appearance import map_errors, open_clip, settings_of

@@ -12,7 +12,7 @@ from shared.io.arrays import load_arrays
 from shared.io.images import read_exr, read_png
 from shared.render import SurfaceMaps, render_frame
 from shared.solve.capture import set_scenery
-from shared.solve.inverse import InverseResult, InverseSettings, shade_vertices
+from shared.solve.inverse_problem import InverseResult, InverseSettings, shade_vertices
 from shared.solve.light_models import LogLight
 from tools import score_measures
 from tools.score import camera_intrinsics, score_geometry

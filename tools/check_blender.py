@@ -27,7 +27,7 @@ from shared.io.arrays import load_arrays, read_json
 from shared.io.images import read_exr, write_png
 from shared.io.meshes import load_mesh
 from shared.raycast import RayScene, camera_hits
-from shared.solve.inverse import FACE_SKIN
+from shared.solve.inverse_problem import FACE_SKIN
 from tools import score_measures
 
 VARIABLE = "LIMN_BLENDER_PYTHON"

@@ -31,7 +31,7 @@ from shared.io.clip_inputs import read_inputs
 from shared.io.images import write_exr
 from shared.io.meshes import write_obj
 from shared.solve.capture import spread_frames
-from shared.solve.inverse import FACE_SKIN, segment_vertices
+from shared.solve.inverse_problem import FACE_SKIN, segment_vertices
 from shared.solve.reference_clip import START_FRAMES, Start, average_texture, make_start
 from shared.solve.views import Camera
 from tools import peer_mitsuba

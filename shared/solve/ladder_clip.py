@@ -11,7 +11,7 @@ import numpy as np
 from shared.gather import SurfaceViewer
 from shared.solve.capture import Sizes, hold_out, set_scenery, spread_frames
 from shared.solve.fit_appearance import Solution
-from shared.solve.inverse import InverseInputs, InverseSettings, capture_skin, frames_of
+from shared.solve.inverse_problem import InverseInputs, InverseSettings, capture_skin, frames_of
 from shared.solve.ladder import FEWEST_HELD_OUT, Ladder, allowed_rungs, describe, serves
 from shared.solve.ladder_gloss import POOLING, VARIATIONS, Gloss, GlossLadder, segments_at
 from shared.solve.reshape import reshape

@@ -17,7 +17,7 @@ from shared.solve.appearance import State
 from shared.solve.capture import set_scenery, spread_frames
 from shared.solve.chart_scale import describe_scale
 from shared.solve.fit_appearance import Solution
-from shared.solve.inverse import FACE_SKIN, InverseResult, InverseSettings, segment_vertices, shade_vertices
+from shared.solve.inverse_problem import FACE_SKIN, InverseResult, InverseSettings, segment_vertices, shade_vertices
 from shared.solve.light_models import LogLight
 from shared.solve.maps import make_maps
 from shared.solve.reference import ReferenceSolver, Start, Views

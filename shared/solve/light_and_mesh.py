@@ -1,0 +1,88 @@
+"""A clip's light and mesh: light on the tracked mesh, the mesh refined under it, light anew, and which mesh is kept.
+
+Either with the full model or with the one that the ladder leads to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from shared.gather import SurfaceViewer
+from shared.solve.capture import Capture, Scenery, set_scenery
+from shared.solve.fit_appearance import Solution, fit_appearance
+from shared.solve.inverse_problem import InverseInputs, InverseSettings, capture_skin, frames_of
+from shared.solve.ladder_clip import climb
+from shared.solve.reshape import reshape
+from shared.solve.shape import Reflectance
+
+
+@dataclass(frozen=True)
+class LitClip:
+    """A clip before its texture pass: the inputs with the mesh that was chosen and its viewer and scenery, settings of
+    the model that was chosen, the capture and its solution, what became of the mesh, the ladder's rungs; tracked: the
+    solution before the mesh was refined, where it was tried."""
+
+    inputs: InverseInputs
+    settings: InverseSettings
+    viewer: SurfaceViewer
+    scenery: Scenery
+    capture: Capture
+    solution: Solution
+    shape_record: dict
+    rungs: tuple[dict, ...]
+    tracked: Solution | None = None
+
+
+def solve_light(
+    inputs: InverseInputs, settings: InverseSettings, viewer: SurfaceViewer, fitted, chart, progress, note
+) -> LitClip:
+    """Light and mesh: those of the full model, or of the one that the ladder leads to."""
+    start, gloss, tracked, shape_record, rungs = None, None, None, {"refined": False}, ()
+    if settings.ladder is not None:
+        climbed = climb(inputs, settings, fitted, chart, progress, note)
+        inputs, settings, start, gloss = climbed.inputs, climbed.settings, climbed.start, climbed.gloss
+        shape_record, rungs = climbed.shape_record, climbed.rungs
+        viewer = SurfaceViewer.of(inputs.mesh)
+    scenery = set_scenery(viewer, settings.sizes, settings.appearance.visibility)
+    solution, capture = _fit_light(inputs, settings, viewer, scenery, fitted, chart, progress, note, start)
+    if settings.shape is not None and inputs.face_segment is not None:
+        known = Reflectance.of(solution, scenery)
+        frames = frames_of(inputs, settings, settings.shape.frames, fitted)
+        reshaped = reshape(inputs, frames, known, settings.appearance, settings.sizes, settings.shape, progress, note)
+        viewer_then = SurfaceViewer.of(reshaped.mesh)
+        scenery_then = set_scenery(viewer_then, settings.sizes, settings.appearance.visibility)
+        more = viewer_then, scenery_then, fitted, chart, progress, note, solution
+        then, capture_then = _fit_light(reshaped, settings, *more)
+        tracked, shape_record = solution, judge_shape(solution, then)
+        note(f"refined mesh: {shape_record}")
+        if shape_record["refined"]:
+            inputs, viewer, scenery = reshaped, viewer_then, scenery_then
+            solution, capture = then, capture_then
+    solution = solution if gloss is None else gloss.worn_by(solution)
+    return LitClip(inputs, settings, viewer, scenery, capture, solution, shape_record, rungs, tracked)
+
+
+def judge_shape(before: Solution, after: Solution) -> dict:
+    """Is the refined mesh kept, and why: held-out residuals, fitted ones where no frame could be held out."""
+    name = "held_out" if before.held_out > 0 else "fitted"
+    residuals = {"before": getattr(before, name), "after": getattr(after, name)}
+    return {"refined": residuals["after"] < residuals["before"], name: residuals}
+
+
+def _fit_light(
+    inputs, settings, viewer, scenery: Scenery, fitted, chart, progress, note, start: Solution | None = None
+) -> tuple[Solution, Capture]:
+    frames = frames_of(inputs, settings, settings.light_frames, fitted)
+    moves, count = settings.appearance.light_moves(inputs.moves), settings.sizes.points
+    capture = replace(capture_skin(inputs, viewer, scenery, frames, moves, count, progress), chart=chart)
+    climbed = settings.ladder is not None and start is not None
+    step = (lambda record: note(_describe(record))), start, climbed
+    return fit_appearance(capture, settings.appearance, *step), capture
+
+
+def _describe(record: dict) -> str:
+    return (
+        f"{record['light']} {record['resolution']}, step {record['step']}: residual {record['fitted']:.5f} fitted, "
+        f"{record['held_out']:.5f} held out; specular {record['specular_intensity']:.3f}, "
+        f"roughness {record['roughness']:.3f}"
+    )
