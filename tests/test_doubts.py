@@ -9,7 +9,7 @@ from toy_capture import FRAMES, make_truth
 
 from shared.errors import InputError
 from shared.io.images import write_exr
-from shared.solve.appearance import Settings
+from shared.solve.appearance import AppearanceSolver, Settings
 from shared.solve.doubts import by_orientation, doubts_about, signs_of, unlikely_colour
 from shared.solve.fit_appearance import fit_appearance
 from stages.inverse_render import check
@@ -25,7 +25,7 @@ def capture(one_thread):
 def signs(capture, colours=None):
     if colours is not None:
         capture = replace(capture, samples=replace(capture.samples, colours=colours.astype(np.float32)))
-    return signs_of(capture, MATTE, fit_appearance(capture, MATTE))
+    return signs_of(AppearanceSolver.at(capture, MATTE, fit_appearance(capture, MATTE).state))
 
 
 @pytest.fixture(scope="module")

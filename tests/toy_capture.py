@@ -97,11 +97,12 @@ def make_truth(
 
 
 def solver_under_true_light(capture):
-    """All unknowns but the roughness as they are."""
+    """All unknowns but the roughness as they are; baked."""
     solver = AppearanceSolver(capture, Settings(resolutions=(16,), noise=(0.003, 0.01), roughness=ROUGHNESS))
     solver.state.params, solver.state.specular = np.log(true_light(cube_directions(16))), SPECULAR
     solver.state.node_albedo = true_albedo(capture.nodes.points.positions)
     solver.state.albedo = true_albedo(capture.points.positions)
+    solver.bake()
     return solver
 
 

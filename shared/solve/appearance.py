@@ -102,6 +102,14 @@ class AppearanceSolver(SampleErrors):
         self.set_light(settings.light_schedule[0])
 
     # ------------------------------------------------------------------ set-up
+    @classmethod
+    def at(cls, capture: Capture, settings: Settings, state: State) -> AppearanceSolver:
+        """At a solved state of the capture, its transfer baked: to look at what the samples say there."""
+        solver = cls(capture, settings)
+        solver.take_state(replace(state))
+        solver.bake()
+        return solver
+
     def _start(self) -> State:
         """Uniform lights of the level that the priors prefer for this radiance."""
         weight = (self.trust * self._skin()).double()

@@ -11,16 +11,12 @@ mean:
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 
 from shared.color import LUMINANCE
 from shared.mesh import normalised
-from shared.solve.appearance import AppearanceSolver, Settings
-from shared.solve.capture import Capture
-from shared.solve.fit_appearance import Solution
+from shared.solve.appearance import AppearanceSolver
 from shared.solve.scale import scale_prior
 
 WANDERING_GAIN, WANDERING_TINT = 0.03, 0.04
@@ -32,13 +28,11 @@ LEAST_MODEL = 0.01
 """Linear radiance below which a ratio to it is noise."""
 
 
-def signs_of(capture: Capture, settings: Settings, solution: Solution) -> dict[str, float]:
-    """{"frame_gain", "frame_tint", "albedo_by_orientation", "unlikely_colour"} of a solution of its capture."""
-    solver = AppearanceSolver(capture, settings)
-    solver.take_state(replace(solution.state))
-    solver.bake()
+def signs_of(solver: AppearanceSolver) -> dict[str, float]:
+    """{"frame_gain", "frame_tint", "albedo_by_orientation", "unlikely_colour"} of a solver at its solution, baked."""
+    capture = solver.capture
     part = solver.subset(slice(None, None, -(-len(capture.points) // POINTS)))
-    if settings.specular:
+    if solver.settings.specular:
         part.bake_lobes()
     gains = frame_gains(part, part.model(*part.forward(part.state.light)))
     weight = part.trust * torch.from_numpy(part.capture.skin.astype(np.float32))[None, :, None]
@@ -47,8 +41,8 @@ def signs_of(capture: Capture, settings: Settings, solution: Solution) -> dict[s
     signs = {
         "frame_gain": gains.mean(1).std(),
         "frame_tint": (gains[:, 0] - gains[:, 2]).std(),
-        "albedo_by_orientation": by_orientation(solution.state.albedo[skin], capture.points.normals[skin]),
-        "unlikely_colour": unlikely_colour(radiance, settings.white_sigma),
+        "albedo_by_orientation": by_orientation(solver.state.albedo[skin], capture.points.normals[skin]),
+        "unlikely_colour": unlikely_colour(radiance, solver.settings.white_sigma),
     }
     return {name: round(float(value), 4) for name, value in signs.items()}
 

@@ -112,12 +112,10 @@ def fit_appearance(
     return Solution(state, tuple(records), *errors, trusted=trusts, frame_errors=by_frame, light_trust=light_trust)
 
 
-def with_local_roughness(capture: Capture, settings: Settings, solution: Solution) -> Solution:
-    """The solution of a capture with roughness that varies over the skin, where that serves."""
-    if not (settings.specular and settings.local_roughness):
+def with_local_roughness(solver: AppearanceSolver, solution: Solution) -> Solution:
+    """The solution that the solver, baked, stands at, with roughness that varies over the skin where that serves."""
+    if not (solver.settings.specular and solver.settings.local_roughness):
         return solution
-    solver = AppearanceSolver(capture, settings)
-    solver.take_state(_copy(solution.state))
     gloss, said = local_roughness(solver)
     return replace(solution, gloss=gloss, gloss_record=said)
 

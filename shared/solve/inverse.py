@@ -8,6 +8,7 @@ import numpy as np
 
 from shared.chart import ChartSight
 from shared.gather import SurfaceViewer
+from shared.solve.appearance import AppearanceSolver
 from shared.solve.chart_scale import describe_scale, doubt_scale, state_chart
 from shared.solve.doubts import doubts_about, signs_of
 from shared.solve.fit_appearance import Solution, with_local_roughness
@@ -19,7 +20,7 @@ from shared.solve.inverse_problem import (
     frames_to_fit,
     shade_vertices,
 )
-from shared.solve.light_and_mesh import solve_light
+from shared.solve.light_and_mesh import LitClip, solve_light
 from shared.solve.light_models import SeveralLights
 from shared.solve.maps import make_maps
 from shared.solve.normal_map import NormalPass, resolved_texels
@@ -52,8 +53,7 @@ def solve_clip(
     chart, warning = state_chart(sights, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves, light)
     lit = solve_light(inputs, settings, viewer, fitted, chart, progress, note)
     inputs, settings, viewer = lit.inputs, lit.settings, lit.viewer
-    signs = signs_of(lit.capture, settings.appearance, lit.solution)
-    solution = with_local_roughness(lit.capture, settings.appearance, lit.solution)
+    signs, solution = examine(lit)
     shading = shade_vertices(inputs, settings.appearance, viewer, lit.scenery, solution, progress)
     surface = TexelSurface(inputs.mesh, settings.map_size)
     clip = Clip(inputs.picture, inputs.camera_from_head, inputs.intrinsics, fitted, inputs.light_index)
@@ -75,6 +75,12 @@ def solve_clip(
     record = {"texture": texture_record, "shape": shape_record, "relief": relief, "signs": signs, "warnings": warnings}
     record |= {"albedo_scale": describe_scale(chart, typical), "rungs": lit.rungs}
     return InverseResult(solution, material, maps, shading, viewer, fitted, record)
+
+
+def examine(lit: LitClip) -> tuple[dict[str, float], Solution]:
+    """What the samples show beside the light: signs of what the model cannot follow, and roughness that varies."""
+    solver = AppearanceSolver.at(lit.capture, lit.settings.appearance, lit.solution.state)
+    return signs_of(solver), with_local_roughness(solver, lit.solution)
 
 
 def specular_at(surface: TexelSurface, solution: Solution) -> float | np.ndarray:

@@ -86,9 +86,7 @@ class GlossLadder:
         rungs: Mapping[str, tuple[str, ...]],
         report: Callable[[dict], None],
     ):
-        self.solver = solver = AppearanceSolver(capture, settings)
-        solver.take_state(trial.solution.state)
-        solver.bake()
+        self.solver = solver = AppearanceSolver.at(capture, settings, trial.solution.state)
         solver.bake_lobes()
         self.irradiance, self.reflection = solver.forward(solver.state.light)
         model = solver.model(self.irradiance, self.reflection)

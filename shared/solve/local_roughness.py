@@ -83,10 +83,9 @@ class GlossEquations:
 
 
 def local_roughness(solver: AppearanceSolver) -> tuple[GlossEquations | None, dict]:
-    """What the samples say of the roughness around each point under the solver's state, and a record; None instead
-    where one value serves as well."""
+    """What the samples say of the roughness around each point under the state of a solver that is baked, and a record;
+    None instead where one value serves as well."""
     state = solver.state
-    solver.bake()
     solver.bake_lobes()
     irradiance, reflection = solver.forward(state.light)
     model = solver.model(irradiance, reflection)
