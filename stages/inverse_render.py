@@ -130,98 +130,9 @@ STAGE = Stage(
 
 CHECKPOINT = "inverse_render.checkpoint.npz"
 LATLONG_HEIGHT = 128
-SPECULAR_SPREAD = 0.25
-"""Standard deviation of the logarithm of people's mean specular intensity about the expected one."""
 FAR_PX = 1.5
 """Median distance of a clip's skin from where the shared mesh shows it, from which on the clips do not go together."""
 FLAT_NORMALS = "flat: fine normals were not solved"
-
-
-def read_settings(job: Job, checkpoint=None):
-    """The stage's parameters as the solver's settings; checkpoint: the reference solver's own file, or None."""
-    from shared.solve.appearance import Settings
-    from shared.solve.capture import Sizes
-    from shared.solve.inverse_problem import InverseSettings
-    from shared.solve.light import LightPriors
-    from shared.solve.shape import ShapeSettings
-
-    params = job.params
-    if params.model == "auto" and params.solver == "reference":
-        raise InputError("model=auto belongs to solver=transfer", where="--set inverse_render.model",
-                         mend="leave out one of the two; the reference solver takes visibility and specular as given")
-    appearance = Settings(
-        light_model=params.light_model,
-        resolutions=tuple(n for n in (8, 16, 32) if n <= params.light_resolution) or (params.light_resolution,),
-        steps=params.light_steps,
-        independent=params.evidence,
-        priors=LightPriors(smooth=params.light_smoothness),
-        white_sigma=params.white_light,
-        visibility=params.visibility,
-        bounce=params.bounce,
-        specular=params.specular,
-        roughness=params.roughness,
-        search_roughness=params.search_roughness,
-        local_roughness=params.local_roughness,
-        specular_prior=(params.specular_prior, SPECULAR_SPREAD),
-    )
-    rim = {} if params.silhouette else {"rim": None}
-    shape = ShapeSettings(
-        subdivisions=params.shape_subdivisions,
-        rounds=params.shape_rounds,
-        frames=params.shape_frames,
-        smoothness=params.shape_smoothness,
-        sigma_mm=params.shape_spread,
-        **rim,
-    )
-    return InverseSettings(
-        sizes=Sizes(params.points, params.directions, params.bounce_nodes),
-        appearance=appearance,
-        light_frames=params.light_frames,
-        map_size=params.map_size,
-        hold_out_every=params.hold_out_every,
-        shape=shape if params.shape else None,
-        fit_frames=params.fit_frames,
-        normal_map=params.normal_map,
-        reference=read_reference(job, checkpoint) if params.solver == "reference" else None,
-        ladder=read_forced(params.forced) if params.model == "auto" else None,
-    )
-
-
-def read_forced(text: str) -> frozenset[str]:
-    """Parts of the model that are not chosen; InputError for one that there is not."""
-    from shared.contract.wording import unknown_name
-    from shared.solve.ladder import PARTS
-
-    forced = frozenset(filter(None, (name.strip() for name in text.split(","))))
-    for name in sorted(forced.difference(PARTS)):
-        raise unknown_name("part of the model", name, PARTS, "--set inverse_render.forced")
-    return forced
-
-
-def read_reference(job: Job, checkpoint):
-    """The reference solver's settings; InputError where the device is absent."""
-    import torch
-
-    from shared.solve.reference_settings import ReferenceSettings, Weights
-    from shared.solve.reference_shade import Sampling
-
-    params = job.params
-    own = {name.removeprefix("reference_"): value for name, value in params.as_dict().items() if "reference_" in name}
-    if own["device"] == "cuda" and not torch.cuda.is_available():
-        raise InputError("no such device here", where="--set inverse_render.reference_device", got="cuda",
-                         mend="take cpu, or a machine and a build of torch with CUDA")
-    samples = {name: own.pop(f"{name}_samples") for name in ("light", "cosine", "lobe")}
-    weights = {name: own.pop(name) for name in ("mask", "laplacian", "white_light", "roughness_variation", "diffuse")}
-    return ReferenceSettings(
-        sampling=Sampling(**samples, visibility=params.visibility, specular=params.specular),
-        weights=Weights(**weights),
-        resolution=own.pop("light_resolution"),
-        roughness=params.roughness,
-        light_model=params.light_model,
-        seed=params.seed,
-        checkpoint=checkpoint,
-        **own,
-    )
 
 
 def write_maps(job: Job, result) -> None:
@@ -269,7 +180,6 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light, poses) -
 
 def read_clips(job: Job) -> tuple:
     """The clip's inputs, or those of all clips."""
-    from shared.errors import InputError
     from shared.io.clip_inputs import read_inputs
 
     params = job.params
@@ -303,6 +213,7 @@ def run(job: Job) -> None:
     from shared.io.arrays import write_json
     from shared.io.clip_inputs import read_mean_texture
     from shared.solve.inverse import solve_clip, summarise
+    from shared.solve.inverse_parameters import read_settings
     from shared.solve.joint_clips import join_clips
 
     clips = read_clips(job)
@@ -314,7 +225,7 @@ def run(job: Job) -> None:
         placed = [{"name": name, **facts} for name, facts in zip(job.clips, inputs.describe(), strict=True)]
         job.note(f"clips in one head space: {placed}")
     sights = inputs.chart_sights() if job.params.chart else ()
-    settings = read_settings(job, job.out.parent / CHECKPOINT)
+    settings = read_settings(job.params, job.out.parent / CHECKPOINT)
     result = solve_clip(inputs, settings, job.progress, job.note, sights)
     record = summarise(inputs, result)
     record["warnings"] += [f"clip {clip['name']} lies {clip['match_px']:.1f} px beside the shared mesh: other lens, "

@@ -17,18 +17,20 @@ from toy_capture import (
 )
 from toy_head import toy_head
 
+from shared.contract.job import Parameters
 from shared.errors import InputError
 from shared.report.gather import ladder_record
 from shared.report.model_sections import climbed_table
 from shared.solve import ladder_clip
 from shared.solve.appearance import Settings
 from shared.solve.fit_appearance import Solution
+from shared.solve.inverse_parameters import read_forced, read_settings
 from shared.solve.inverse_problem import InverseSettings
 from shared.solve.ladder import LIGHTS, Ladder, Model, Trial, allowed_rungs, gain, serves
 from shared.solve.ladder_clip import climb
 from shared.solve.ladder_gloss import VARIATIONS, Gloss, GlossLadder, segments_at
 from shared.solve.shape import ShapeSettings
-from stages.inverse_render import STAGE, read_forced, read_settings
+from stages.inverse_render import STAGE
 
 CAREFUL = Settings(resolutions=(8, 16), noise=(0.003, 0.01))
 
@@ -236,26 +238,22 @@ def test_too_few_held_out_frames_choose_no_model(one_thread, monkeypatch):
     assert "2 frames are too few" in notes[0]
 
 
-class Told:
+def told(**changes):
     """A stage's parameters with some changed."""
-
-    def __init__(self, **changes):
-        from shared.contract.job import Parameters
-
-        self.params = Parameters({**STAGE.defaults(), **STAGE.parse(changes, "test")})
+    return Parameters({**STAGE.defaults(), **STAGE.parse(changes, "test")})
 
 
 def test_the_stage_climbs_only_when_told_to():
-    assert read_settings(Told()).ladder is None
-    assert read_settings(Told(model="auto")).ladder == frozenset()
-    assert read_settings(Told(model="auto", forced="light, geometry")).ladder == {"light", "geometry"}
+    assert read_settings(told()).ladder is None
+    assert read_settings(told(model="auto")).ladder == frozenset()
+    assert read_settings(told(model="auto", forced="light, geometry")).ladder == {"light", "geometry"}
 
 
 def test_forcing_what_there_is_not_is_one_clear_line():
     with pytest.raises(InputError, match="unknown part of the model 'ligth'.*did you mean light"):
         read_forced("ligth")
     with pytest.raises(InputError, match="model=auto belongs to solver=transfer"):
-        read_settings(Told(model="auto", solver="reference"))
+        read_settings(told(model="auto", solver="reference"))
 
 
 def test_the_ladder_reaches_run_json_and_the_report(glossy, tmp_path):

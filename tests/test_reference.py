@@ -13,13 +13,14 @@ from shared.gather import SurfaceViewer
 from shared.solve.capture import Sizes
 from shared.solve.frame_choice import covering_frames
 from shared.solve.inverse import solve_clip, summarise
+from shared.solve.inverse_parameters import read_settings
 from shared.solve.inverse_problem import InverseSettings, frames_to_fit
 from shared.solve.reference import ReferenceSolver
 from shared.solve.reference_clip import Checkpoint
 from shared.solve.reference_settings import ReferenceSettings
 from shared.solve.reference_shade import Sampling
 from shared.solve.reference_shape import LargeSteps
-from stages.inverse_render import STAGE, read_settings
+from stages.inverse_render import STAGE
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -160,17 +161,17 @@ def test_few_frames_cover_the_face(clip):
     assert fitted.sum() == 3 and len(fitted) == FRAMES
 
 
-class _Job:
-    def __init__(self, **changes):
-        self.params = Parameters({**STAGE.defaults(), **STAGE.parse(changes, "test")})
+def told(**changes):
+    """A stage's parameters with some changed."""
+    return Parameters({**STAGE.defaults(), **STAGE.parse(changes, "test")})
 
 
 def test_the_stage_hands_its_parameters_on():
     """The declaration's defaults are the published numbers; other values arrive where they belong."""
-    published = read_settings(_Job(solver="reference", roughness=0.45)).reference
+    published = read_settings(told(solver="reference", roughness=0.45)).reference
     assert replace(published, roughness=0.45) == ReferenceSettings()
     changed = read_settings(
-        _Job(
+        told(
             solver="reference",
             reference_light_samples=32,
             reference_mask=0.5,
@@ -182,10 +183,10 @@ def test_the_stage_hands_its_parameters_on():
     ).reference
     assert changed.sampling == Sampling(32, 256, 64, visibility=False, specular=False)
     assert (changed.weights.mask, changed.light_model, changed.pixels) == (0.5, "sun_sky", 100)
-    assert read_settings(_Job()).reference is None
+    assert read_settings(told()).reference is None
     if not torch.cuda.is_available():
         with pytest.raises(InputError, match="reference_device"):
-            read_settings(_Job(solver="reference", reference_device="cuda"))
+            read_settings(told(solver="reference", reference_device="cuda"))
 
 
 def test_checkpoints_know_what_they_belong_to(clip):

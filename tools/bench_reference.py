@@ -29,7 +29,8 @@ from shared.solve.inverse import solve_clip
 from shared.solve.inverse_problem import frames_to_fit
 from shared.solve.reference import ReferenceSolver
 from shared.solve.reference_clip import solve_by_reference
-from tools.bench_appearance import map_errors, open_clip, settings_of
+from tools.appearance_errors import map_errors
+from tools.bench_appearance import open_clip, settings_of
 from tools.svg_file import save_line_chart
 
 FIELDS = ("label", "solver", "size", "seconds", "iteration", "delta_e2000_median", "delta_e2000_p90", "psnr_linear")

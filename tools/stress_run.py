@@ -22,7 +22,7 @@ from shared.contract.pipeline import Pipeline
 from shared.io.clip_inputs import read_inputs
 from shared.io.images import read_exr
 from shared.io.meshes import load_mesh, write_obj
-from tools.bench_appearance import map_errors
+from tools.appearance_errors import map_errors
 from tools.gates import MEASURES, Flag
 from tools.score import score
 
