@@ -65,8 +65,6 @@ STAGE = Stage(
 )
 
 SMALLEST_HEAD_MM, LARGEST_HEAD_MM = 100.0, 800.0
-HELD_OUT_SHOWN = 4
-"""Held-out frames that the report re-renders beside the others."""
 
 
 def read_maps(folder: Path) -> dict:
@@ -160,27 +158,14 @@ def light_moves(job: Job, moves: str) -> str:
     return "head" if job.manifest("inverse_render")["parameters"].get("light_model") == "camera" else moves
 
 
-def held_out_cameras(poses: dict, frames, solve: dict) -> dict:
-    """{frame: Camera} of a few held-out frames that inverse_render did not re-render."""
-    from shared.solve.capture import spread_frames
-    from shared.solve.views import Camera
-
-    place = {int(frame): f for f, frame in enumerate(poses["frame_index"])}
-    done = set(solve["render_frames"])
-    rest = [frame for frame in solve.get("held_out_frames", ()) if frame in place and frame not in done]
-    chosen = [rest[i] for i in spread_frames(len(rest), HELD_OUT_SHOWN)] if rest else []
-    lens = poses.get("intrinsics_crop", frames.intrinsics)
-    return {frame: Camera(poses["camera_from_head"][place[frame]], lens, frames.size) for frame in chosen}
-
-
 def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, frames, solve: dict):
     """Writes views/novel_*.exr, views/relit_*.exr and the lights -> the ViewSet; None when switched off."""
-    from shared.solve.views import make_views
+    from shared.solve.views import held_out_cameras, make_views
     from shared.studio_lights import STUDIO_LIGHTS, studio_light
 
     if not job.params.views:
         return None
-    cameras, moves = held_out_cameras(poses, frames, solve), light_moves(job, frames.moves)
+    cameras, moves = held_out_cameras(poses, frames.intrinsics, frames.size, solve), light_moves(job, frames.moves)
     clip = envmap, poses["camera_from_head"], moves
     views = make_views(mesh, maps, *clip, job.params.view_size, cameras, job.progress)
     (job.out / "views").mkdir()
@@ -283,7 +268,7 @@ def check(job: Job) -> None:
     import numpy as np
 
     from shared.io.arrays import load_arrays
-    from shared.io.export_maps import MAPS, UDIM_TILE
+    from shared.io.export_maps import MAPS, map_errors, map_file
     from shared.io.images import read_exr
     from shared.io.meshes import read_obj
     from shared.io.usd_validate import package_errors, usd_errors
@@ -295,8 +280,7 @@ def check(job: Job) -> None:
     if not SMALLEST_HEAD_MM < size < LARGEST_HEAD_MM:
         errors.append(f"mesh.obj: {size:.0f} mm is not the size of a head")
     for name in MAPS:
-        file = f"{name}.{UDIM_TILE}.exr" if job.params.udim else f"{name}.exr"
-        errors += map_errors(name, read_exr(job.out / "maps" / file))
+        errors += map_errors(name, read_exr(job.out / "maps" / map_file(name, job.params.udim)))
     rotations = load_arrays(job.out / "poses.npz")["camera_from_head"][:, :3, :3]
     if not np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-6):
         errors.append("poses.npz: not all poses are rigid")
@@ -305,19 +289,6 @@ def check(job: Job) -> None:
         errors += usd_errors(job.out / "head.usdz") + package_errors(job.out / "head.usdz")
     if errors:
         raise LimnError("the result does not pass its checks: " + "; ".join(errors))
-
-
-def map_errors(name: str, values) -> list[str]:
-    """Sentences about a map's shape and range."""
-    height, width = values.shape[:2]
-    errors = []
-    if height != width or width & (width - 1):
-        errors.append(f"{name}: {width} x {height} is not a square power of two")
-    if values.min() < -1e-3:
-        errors.append(f"{name}: negative values down to {values.min():.4g}")
-    if name in ("confidence", "normal", "roughness") and values.max() > 1.0 + 1e-3:
-        errors.append(f"{name}: values up to {values.max():.4g}, expected at most 1")
-    return errors
 
 
 if __name__ == "__main__":

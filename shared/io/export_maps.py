@@ -37,6 +37,11 @@ def acescg_from_rec709(rgb: np.ndarray) -> np.ndarray:
     return (np.asarray(rgb, np.float64) @ matrix.T).astype(np.float32)
 
 
+def map_file(name: str, udim: bool) -> str:
+    """Name of a map's file; udim: as a tile of a set."""
+    return f"{name}.{UDIM_TILE}.exr" if udim else f"{name}.exr"
+
+
 class MapWriter:
     """Writes linear Rec.709 and data arrays with one choice of precision, colour space, layout and names.
 
@@ -62,7 +67,7 @@ class MapWriter:
 
     def file_name(self, name: str) -> str:
         """The map's file."""
-        return f"{name}.{UDIM_TILE}.exr" if self.udim else f"{name}.exr"
+        return map_file(name, self.udim)
 
     def write_colour(self, path: Path, rgb: np.ndarray, unit: str, *, latlong: bool = False) -> None:
         """[H, W, 3] scene-linear Rec.709 -> EXR in colour_space."""
@@ -119,3 +124,16 @@ def paste_crop(crop: np.ndarray, placement: tuple[float, float, float], size: tu
     to_crop = np.array([[scale, 0.0, (0.5 - x0) * scale - 0.5], [0.0, scale, (0.5 - y0) * scale - 0.5]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(crop, to_crop, size, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
+
+
+def map_errors(name: str, values: np.ndarray) -> list[str]:
+    """Sentences about a map's shape and range."""
+    height, width = values.shape[:2]
+    errors = []
+    if height != width or width & (width - 1):
+        errors.append(f"{name}: {width} x {height} is not a square power of two")
+    if values.min() < -1e-3:
+        errors.append(f"{name}: negative values down to {values.min():.4g}")
+    if name in ("confidence", "normal", "roughness") and values.max() > 1.0 + 1e-3:
+        errors.append(f"{name}: values up to {values.max():.4g}, expected at most 1")
+    return errors

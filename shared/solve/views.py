@@ -19,7 +19,7 @@ from shared.mesh import Mesh, interpolate, normalised
 from shared.raycast import camera_hits
 from shared.render import SurfaceMaps, render_frame
 from shared.shading import DEEP, Material, VertexShading
-from shared.solve.capture import Sizes, face_front, set_scenery
+from shared.solve.capture import Sizes, face_front, set_scenery, spread_frames
 from shared.split_sum import SplitSum
 from shared.studio_lights import STUDIO_LIGHTS, studio_light
 from shared.texture import sample_bilinear
@@ -31,6 +31,8 @@ DISTANCE_MM, FILLED = 900.0, 1.1
 LIGHT_RESOLUTION, VIEW_SIZES = 16, Sizes(directions=640, nodes=500)
 ORIENTATION_MM = 40.0
 RELIT_YAW_DEG = -15.0
+HELD_OUT_SHOWN = 4
+"""Held-out frames that the report re-renders beside the others."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,22 @@ def orbit_camera(mesh: Mesh, yaw_deg: float, pitch_deg: float, pixels: int) -> C
     focal = FILLED * pixels / 2 * DISTANCE_MM / radius
     intrinsics = np.array([[focal, 0.0, pixels / 2], [0.0, focal, pixels / 2], [0.0, 0.0, 1.0]])
     return Camera(rigid(rotation, -rotation @ (middle + DISTANCE_MM * back)), intrinsics, (pixels, pixels))
+
+
+def held_out_cameras(
+    poses: Mapping[str, np.ndarray], intrinsics: np.ndarray, size: tuple[int, int], solve: Mapping
+) -> dict[int, Camera]:
+    """{frame: Camera} of a few held-out frames that inverse_render did not re-render.
+
+    poses: its poses.npz; intrinsics [3, 3] and size of the crop, where that does not hold the former; solve: its
+    solve.json.
+    """
+    place = {int(frame): f for f, frame in enumerate(poses["frame_index"])}
+    done = set(solve["render_frames"])
+    rest = [frame for frame in solve.get("held_out_frames", ()) if frame in place and frame not in done]
+    chosen = [rest[i] for i in spread_frames(len(rest), HELD_OUT_SHOWN)] if rest else []
+    lens = poses.get("intrinsics_crop", intrinsics)
+    return {frame: Camera(poses["camera_from_head"][place[frame]], lens, size) for frame in chosen}
 
 
 def frontal_frame(camera_from_head: np.ndarray) -> int:
