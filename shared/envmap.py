@@ -25,6 +25,8 @@ _FACE_AXES = np.array(
     ],
     np.float64,
 )
+# The same as coordinate and sign: each axis of a face is one of the three, forwards or backwards.
+_COORDINATE, _SIGN = np.abs(_FACE_AXES).argmax(-1), _FACE_AXES.sum(-1)
 
 
 def cube_directions(resolution: int) -> np.ndarray:
@@ -53,7 +55,7 @@ def cube_face_coordinates(directions: np.ndarray, resolution: int) -> tuple[np.n
     axis = np.abs(d).argmax(1)
     index = np.arange(len(d))
     face = 2 * axis + (d[index, axis] < 0)
-    local = np.einsum("mij,mj->mi", _FACE_AXES[face], d)
+    local = np.take_along_axis(d, _COORDINATE[face], axis=1) * _SIGN[face]
     scale = 0.5 * resolution / local[:, 2]
     return face, local[:, 0] * scale + 0.5 * resolution, local[:, 1] * scale + 0.5 * resolution
 

@@ -100,13 +100,14 @@ class SurfaceViewer:
         origins = vertices[index] + self.offset * self.normals[index]
         hidden = index[self.scene.occluded(origins, towards[index])]
         weight = np.where(seen, cosine**2, 0.0)
-        weight[self._grow(hidden)] = 0.0
+        covered = np.zeros(len(vertices), bool)
+        covered[hidden] = True
+        weight[self.grown(covered)] = 0.0
         return View(pixels, depth, cosine, towards, weight.astype(np.float32))
 
-    def _grow(self, hidden: np.ndarray) -> np.ndarray:
-        """[V] bool: the hidden vertices and their neighbours over the margin."""
-        grown = np.zeros(len(self.mesh.vertices), np.float32)
-        grown[hidden] = 1.0
+    def grown(self, chosen: np.ndarray) -> np.ndarray:
+        """[V] bool: the chosen vertices [V] and their neighbours over the margin."""
+        grown = chosen.astype(np.float32)
         for _ in range(self.rings):
             grown = np.minimum(grown + self._adjacency @ grown, 1.0)
         return grown > 0

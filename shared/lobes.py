@@ -7,9 +7,8 @@ wider than its spacing (sqrt(4 pi / J)): with 768 directions roughness 0.25 and 
 (wet lips, oil, eyes) get their weights from the split sum. Where the head itself blocks the lobe, the blocked weight
 is returned too, so that the caller can fill in light that bounced.
 
-The tables for the solver are kept as bfloat16 [F, P, J] (2 bytes per entry): rounding errors are independent between
-directions and average out in the sum. A weight takes some forty operations on numbers that are not needed again, so
-the loops are compiled and a point's weights never leave the cache (15 times as fast as array operations, on one core).
+A weight takes some forty operations on numbers that are not needed again, so the loops are compiled and a point's
+weights never leave the cache (15 times as fast as array operations, on one core).
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from __future__ import annotations
 from copy import copy
 
 import numpy as np
-import torch
 
 from shared.brdf import F0, MINIMUM_COSINE
 from shared.compiled import compiled
@@ -89,42 +87,19 @@ def specular_reflection(
         where = table.normals, towards, table.alpha2(roughness), table.directions, table.visible
         _sum_lobes(*where, channels, result, blocked)
     else:
-        for part in _blocks(table):
+        for part in blocks_of(table):
             every, seen = table.split_sum(part, towards[part], roughness)
             result[part], blocked[part] = seen @ light, every.sum(1) - seen.sum(1)
     return result if blocked_light is None else result + blocked[:, None] * blocked_light
 
 
-def specular_tables(
-    table: LobeTable, towards: np.ndarray, roughness: float | np.ndarray
-) -> tuple[torch.Tensor, np.ndarray]:
-    """The lobes of all points in F views: open weights bfloat16 [F, P, J] and blocked weight float32 [P, F].
-
-    towards [P, F, 3]. With light [F, J, C] the reflection is torch.bmm(table, light).
-    """
-    points, frames = towards.shape[:2]
-    bits = np.empty((frames, points, table.directions.shape[1]), np.int16)
-    weights = torch.from_numpy(bits).view(torch.bfloat16)
-    blocked = np.zeros((frames, points), np.float32)
-    for f in range(frames):
-        view = np.ascontiguousarray(towards[:, f], np.float32)
-        if table.resolves(roughness):
-            where = table.normals, view, table.alpha2(roughness), table.directions, table.visible
-            _tabulate_lobes(*where, bits[f], blocked[f])
-            continue
-        for part in _blocks(table):
-            every, seen = table.split_sum(part, view[part], roughness)
-            weights[f, part] = torch.from_numpy(seen)
-            blocked[f, part] = every.sum(1) - seen.sum(1)
-    return weights, np.ascontiguousarray(blocked.T)
-
-
-def _blocks(table: LobeTable) -> list[slice]:
+def blocks_of(table: LobeTable) -> list[slice]:
+    """Parts of the points whose weights fit into memory."""
     return [slice(start, start + _POINTS_PER_BLOCK) for start in range(0, len(table), _POINTS_PER_BLOCK)]
 
 
 @compiled
-def _weigh_directions(normal, towards, alpha2, directions, weights):
+def weigh_directions(normal, towards, alpha2, directions, weights):
     """One point's lobe on all directions [3, J] -> weights [J]: brdf.specular_cosine times the solid angle.
 
     D's alpha^2 / pi, both masking terms' factor 2, the denominator's 4 cos_o and the solid angle 4 pi / J make up the
@@ -149,7 +124,7 @@ def _weigh_directions(normal, towards, alpha2, directions, weights):
 
 
 @compiled
-def _cover(weights, visible):
+def cover_lobe(weights, visible):
     """Clears the weights [J] of directions that are not visible [J] and returns their sum."""
     every, seen = np.float32(0.0), np.float32(0.0)
     for j in range(len(weights)):
@@ -165,23 +140,10 @@ def _sum_lobes(normals, towards, alpha2, directions, visible, light, result, blo
     count = directions.shape[1]
     weights = np.empty(count, np.float32)
     for p in range(len(normals)):
-        _weigh_directions(normals[p], towards[p], alpha2[p], directions, weights)
-        blocked[p] = _cover(weights, visible[p])
+        weigh_directions(normals[p], towards[p], alpha2[p], directions, weights)
+        blocked[p] = cover_lobe(weights, visible[p])
         for c in range(len(light)):
             total = np.float32(0.0)
             for j in range(count):
                 total += weights[j] * light[c, j]
             result[p, c] = total
-
-
-@compiled
-def _tabulate_lobes(normals, towards, alpha2, directions, visible, bits, blocked):
-    """The open weights as bfloat16 bits [P, J], rounded to the nearest even; blocked [P]: the weight of the others."""
-    count = directions.shape[1]
-    weights = np.empty(count, np.float32)
-    words = weights.view(np.int32)
-    for p in range(len(normals)):
-        _weigh_directions(normals[p], towards[p], alpha2[p], directions, weights)
-        blocked[p] = _cover(weights, visible[p])
-        for j in range(count):
-            bits[p, j] = (words[j] + 0x7FFF + ((words[j] >> 16) & 1)) >> 16

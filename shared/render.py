@@ -11,11 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shared.compiled import compiled
 from shared.gather import SurfaceViewer
-from shared.mesh import interpolate
 from shared.raycast import camera_hits
 from shared.shading import VertexShading
-from shared.texture import sample_bilinear
 
 
 @dataclass(frozen=True)
@@ -42,18 +41,46 @@ def render_frame(
     over the rays that hit the head, so that partly covered pixels are not darkened.
     """
     width, height = size
+    mesh = viewer.mesh
     shade = np.concatenate([shading.irradiance(frame), shading.reflection(frame)], axis=1)
+    surface = mesh.faces, mesh.face_uvs, mesh.uvs.astype(np.float32)
+    textures = (np.ascontiguousarray(texture, np.float32) for texture in (maps.albedo, maps.specular_intensity))
+    surface = *surface, *textures, np.ascontiguousarray(shade, np.float32)
     radiance, hits = np.zeros((height * width, 3), np.float32), np.zeros(height * width, np.float32)
     for row in range(samples):
         for column in range(samples):
             offsets = (column + 0.5) / samples, (row + 0.5) / samples
             face, bary, _ = camera_hits(viewer.scene, camera_from_head, intrinsics, width, height, offsets)
-            pixel = np.nonzero(face.ravel() >= 0)[0]
-            face, bary = face.ravel()[pixel], bary.reshape(-1, 3)[pixel]
-            uv = interpolate(viewer.mesh.uvs, viewer.mesh.face_uvs, face, bary)
-            both = interpolate(shade, viewer.mesh.faces, face, bary)
-            albedo, intensity = sample_bilinear(maps.albedo, uv), sample_bilinear(maps.specular_intensity, uv)
-            radiance[pixel] += albedo * both[:, :3] + intensity[:, None] * both[:, 3:]
-            hits[pixel] += 1.0
+            _add_radiance(face.ravel(), bary.reshape(-1, 3), *surface, radiance, hits)
     radiance /= np.maximum(hits, 1.0)[:, None]
     return radiance.reshape(height, width, 3), (hits / samples**2).reshape(height, width)
+
+
+@compiled
+def _add_radiance(face, bary, faces, face_uvs, uvs, albedo, specular_intensity, shade, radiance, hits):
+    """Adds to radiance [N, 3] and hits [N] what rays see: face [N] (-1: nothing), bary [N, 3]; shade [V, 6]: E and S;
+    maps as by texture.sample_bilinear."""
+    one, half, size = np.float32(1.0), np.float32(0.5), len(albedo)
+    for n in range(len(face)):
+        if face[n] < 0:
+            continue
+        hits[n] += one
+        u, v = np.float32(0.0), np.float32(0.0)
+        for k in range(3):
+            u += bary[n, k] * uvs[face_uvs[face[n], k], 0]
+            v += bary[n, k] * uvs[face_uvs[face[n], k], 1]
+        x, y = u * size - half, (one - v) * size - half
+        left, top = int(np.floor(x)), int(np.floor(y))
+        fx, fy = x - np.float32(left), y - np.float32(top)
+        right, bottom, left, top = (left + 1) % size, (top + 1) % size, left % size, top % size
+        corners = (one - fx) * (one - fy), fx * (one - fy), (one - fx) * fy, fx * fy
+        gloss = (corners[0] * specular_intensity[top, left] + corners[1] * specular_intensity[top, right]
+                 + corners[2] * specular_intensity[bottom, left] + corners[3] * specular_intensity[bottom, right])
+        for c in range(3):
+            diffuse = (corners[0] * albedo[top, left, c] + corners[1] * albedo[top, right, c]
+                       + corners[2] * albedo[bottom, left, c] + corners[3] * albedo[bottom, right, c])
+            irradiance, reflection = np.float32(0.0), np.float32(0.0)
+            for k in range(3):
+                irradiance += bary[n, k] * shade[faces[face[n], k], c]
+                reflection += bary[n, k] * shade[faces[face[n], k], c + 3]
+            radiance[n, c] += diffuse * irradiance + gloss * reflection

@@ -10,6 +10,7 @@ depend on the camera and are made for key frames, a few degrees of turn apart.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ from shared.envmap import frame_lookup
 from shared.geometry import camera_centres, vector_from_rotation, world_from_head
 from shared.lobes import LobeTable, specular_reflection
 from shared.mesh import normalised
-from shared.transfer import Points, Transfer, irradiance, node_radiosity
+from shared.transfer import Points, Transfer, bounced_irradiance, irradiance, node_radiosity
 
 KEY_STEP = 0.05
 """Radians between frames whose lobe sums are computed (3 degrees)."""
@@ -79,22 +80,39 @@ class VertexShading:
     ):
         self.material, self.directions = material, directions
         self.points, self.transfer = points, transfer
-        self.light_along = light_along(light, directions, world_from_head(camera_from_head, moves), light_index)
-        flat = self.light_along.reshape(len(directions), -1)
-        radiosity = _radiosity(node_transfer, material, self.light_along) if bounce else None
-        shape = (len(index), len(camera_from_head), 3)
-        direct = irradiance(transfer, flat)
-        total = irradiance(transfer, flat, radiosity) if bounce else direct
-        self._irradiance = total.reshape(shape).astype(np.float16)
-        self._bounced = (total - direct).reshape(shape).astype(np.float16)
         self.table = LobeTable(points.normals, transfer.visibility(), directions)
+        self.stand_in = _stand_ins(vertices, index, transfer.blocked, deep)
+        self._node_direct = node_transfer.direct.astype(np.float32)
+        self._radiosity = node_radiosity(node_transfer, material.bounce_albedo()).astype(np.float32) if bounce else None
+        self._key_step = key_step
+        self._light(light, camera_from_head, moves, light_index)
+
+    def under(self, light: np.ndarray, camera_from_head: np.ndarray, moves: str) -> VertexShading:
+        """The same surface under one other light, in other frames."""
+        other = copy(self)
+        other._light(light, camera_from_head, moves, None)
+        return other
+
+    def _light(self, light, camera_from_head, moves, light_index) -> None:
+        self.light_along = light_along(light, self.directions, world_from_head(camera_from_head, moves), light_index)
+        shape = (len(self.points), len(camera_from_head), 3)
+        direct = irradiance(self.transfer, self.light_along.reshape(len(self.directions), -1))
+        bounces = self._radiosity is not None
+        bounced = bounced_irradiance(self.transfer, self._sent_by_nodes()) if bounces else np.zeros_like(direct)
+        self._irradiance = (direct + bounced).reshape(shape).astype(np.float16)
+        self._bounced = bounced.reshape(shape).astype(np.float16)
         self._centres = camera_centres(camera_from_head)
         self._turn = turned_so_far(camera_from_head)
         if light_index is not None:  # so that no frame lies between key frames of two lights
             self._turn += 2.0 * np.pi * light_index
-        self._keys = key_frames(self._turn, key_step)
+        self._keys = key_frames(self._turn, self._key_step)
         self._key_reflection: dict[int, np.ndarray] = {}
-        self.stand_in = _stand_ins(vertices, index, transfer.blocked, deep)
+
+    def _sent_by_nodes(self) -> np.ndarray:
+        """[K, F * 3]: the nodes' radiosity over pi, with all diffuse bounces."""
+        channels = range(self.light_along.shape[-1])
+        sent = [self._radiosity[..., c] @ (self._node_direct @ self.light_along[..., c]) for c in channels]
+        return np.stack(sent, axis=-1).reshape(len(self._node_direct), -1)
 
     def irradiance(self, frame: int) -> np.ndarray:
         """E [V, 3] float32 over pi."""
@@ -215,11 +233,3 @@ def light_along(
     lookup = frame_lookup(directions, world_from_head, resolution, light_index)
     values = lookup @ np.asarray(light, np.float64)
     return values.astype(np.float32).reshape(len(directions), len(world_from_head), -1)
-
-
-def _radiosity(nodes: Transfer, material: Material, along: np.ndarray) -> np.ndarray:
-    """[K, F * 3]: what the nodes send out, over pi, with all diffuse bounces."""
-    matrices = node_radiosity(nodes, material.bounce_albedo())
-    direct = nodes.direct.astype(np.float32)
-    per_channel = [matrices[..., c].astype(np.float32) @ (direct @ along[..., c]) for c in range(along.shape[-1])]
-    return np.stack(per_channel, axis=-1).reshape(len(direct), -1)

@@ -23,6 +23,7 @@ from shared.envmap import cube_directions, cube_texel
 
 SAMPLES = 64
 _TABLE_RESOLUTION, _NEIGHBOURS = 48, 3
+_POINTS_PER_BLOCK = 256
 _COSINES = (np.arange(64) + 0.5) / 64
 
 
@@ -77,7 +78,7 @@ class SplitSum:
         half = sample_half_vectors(roughness)
         local = 2.0 * half[:, 2:] * half - np.array([0.0, 0.0, 1.0])
         local, cosine = local[local[:, 2] > 0], local[local[:, 2] > 0, 2]
-        world = np.einsum("kj,pji->pki", local, frames_about(reflected))
+        world = local @ frames_about(reflected)
         texel = cube_texel(world.reshape(-1, 3), _TABLE_RESOLUTION)
         count, total = len(reflected), len(self.directions)
         weight = (cosine / cosine.sum())[:, None] * self._share[texel].reshape(count, len(local), _NEIGHBOURS)
@@ -91,10 +92,19 @@ class SplitSum:
 
         towards [P, 3]: to the camera. Directions below the horizon do not count.
         """
-        half = np.einsum("kj,pji->pki", sample_half_vectors(roughness), frames_about(normals))
-        o_dot_h = np.einsum("pki,pi->pk", half, towards)
+        half, share = sample_half_vectors(roughness), np.empty(len(normals))
+        for start in range(0, len(normals), _POINTS_PER_BLOCK):
+            part = slice(start, start + _POINTS_PER_BLOCK)
+            share[part] = self._visible_share(half, normals[part], towards[part], visible[part])
+        return share
+
+    def _visible_share(
+        self, half: np.ndarray, normals: np.ndarray, towards: np.ndarray, visible: np.ndarray
+    ) -> np.ndarray:
+        half = half @ frames_about(normals)
+        o_dot_h = (half @ towards[..., None])[..., 0]
         incoming = 2.0 * o_dot_h[..., None] * half - towards[:, None]
-        above = (np.einsum("pki,pi->pk", incoming, normals) > 0) & (o_dot_h > 0)
+        above = ((incoming @ normals[..., None])[..., 0] > 0) & (o_dot_h > 0)
         texel = cube_texel(incoming.reshape(-1, 3), _TABLE_RESOLUTION)
         nearest = self._nearest[texel, 0].reshape(above.shape)
         # A sample above the horizon may find its nearest direction below: nothing covers it there.

@@ -148,13 +148,13 @@ def trace_transfer(
     bounce = np.zeros((count, len(nodes.points)), np.float16)
     blocked = np.zeros(count, np.float32)
     visible = np.zeros((count, (total + 7) // 8), np.uint8)
+    starts, along_rays = (np.asarray(x, np.float32) for x in (points.positions + offset * points.normals, directions))
     batch = max(1, 2 * _RAYS_PER_BATCH // total)
     for start in progress(range(0, count, batch)):
         part = slice(start, min(start + batch, count))
         weight = np.maximum(points.normals[part] @ directions.T, 0.0) * (4.0 / total)
         which, along = np.nonzero((weight > 0) & visibility)
-        origins = (points.positions[part] + offset * points.normals[part])[which]
-        face = scene.intersect(origins, directions[along])[0]
+        face = scene.first_faces(starts[part][which], along_rays[along])
         hit = face >= 0
         factor = weight[which[hit], along[hit]]
         entry = which[hit] * len(nodes.points) + nodes.of_face[face[hit]]
@@ -185,11 +185,19 @@ def irradiance(
 
     Works through the points in batches so that the half-precision tables are widened a part at a time.
     """
-    light = np.ascontiguousarray(light, np.float32)
-    result = np.empty((len(transfer.direct), light.shape[1]), np.float32)
+    direct = _widened_product(transfer.direct, light, batch)
+    return direct if radiosity is None else direct + bounced_irradiance(transfer, radiosity, batch)
+
+
+def bounced_irradiance(transfer: Transfer, radiosity: np.ndarray, batch: int = 4096) -> np.ndarray:
+    """The part of irradiance that came by way of the nodes: radiosity [K, N] -> [P, N] float32."""
+    return _widened_product(transfer.bounce, radiosity, batch)
+
+
+def _widened_product(table: np.ndarray, values: np.ndarray, batch: int) -> np.ndarray:
+    values = np.ascontiguousarray(values, np.float32)
+    result = np.empty((len(table), values.shape[1]), np.float32)
     for start in range(0, len(result), batch):
         part = slice(start, start + batch)
-        np.matmul(transfer.direct[part].astype(np.float32), light, out=result[part])
-        if radiosity is not None:
-            result[part] += transfer.bounce[part].astype(np.float32) @ radiosity.astype(np.float32)
+        np.matmul(table[part].astype(np.float32), values, out=result[part])
     return result

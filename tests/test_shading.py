@@ -18,7 +18,8 @@ from shared.gather import (
     texel_size,
 )
 from shared.geometry import fibonacci_sphere, rigid, rotation_from_vector
-from shared.lobes import LobeTable, specular_reflection, specular_tables
+from shared.lobe_tables import specular_tables
+from shared.lobes import LobeTable, specular_reflection
 from shared.mesh import normalised
 from shared.raycast import RayScene
 from shared.shading import Material, VertexShading, key_frames, turned_so_far

@@ -25,7 +25,8 @@ import numpy as np
 from shared.gather import SurfaceViewer
 from shared.geometry import fibonacci_sphere
 from shared.io.clip_inputs import ClipInputs, read_inputs
-from shared.lobes import LobeTable, specular_tables
+from shared.lobe_tables import specular_tables
+from shared.lobes import LobeTable
 from shared.solve.fit_appearance import Solution
 from shared.solve.inverse_problem import frames_to_fit
 from shared.solve.light_and_mesh import solve_light

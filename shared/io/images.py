@@ -149,8 +149,8 @@ def exr_size(path: Path | str) -> tuple[int, int]:
 
 def write_png(path: Path | str, array: np.ndarray) -> None:
     """Writes [H, W] or [H, W, 3] RGB, uint8 or uint16, losslessly."""
-    ordered = array[..., ::-1] if array.ndim == 3 else array
-    done, data = cv2.imencode(".png", np.ascontiguousarray(ordered), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    ordered = cv2.cvtColor(array, cv2.COLOR_RGB2BGR) if array.ndim == 3 else array
+    done, data = cv2.imencode(".png", ordered, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:
         raise LimnError(f"{path}: could not be encoded")
     Path(path).write_bytes(data)  # imwrite would not say that the disk is full
@@ -163,4 +163,4 @@ def read_png(path: Path | str) -> np.ndarray:
         raise InputError("missing or not a readable PNG", where=str(path))
     if array.ndim == 2:
         return array
-    return np.ascontiguousarray(array[..., 2::-1])
+    return cv2.cvtColor(array, cv2.COLOR_BGR2RGB if array.shape[2] == 3 else cv2.COLOR_BGRA2RGB)

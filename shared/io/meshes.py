@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -37,40 +38,53 @@ def write_obj(path: Path | str, mesh: Mesh) -> None:
     corners = np.stack([mesh.faces, mesh.face_uvs], axis=-1).reshape(len(mesh.faces), -1) + 1
     with open(path, "w", encoding="ascii") as file:
         file.write("# head space, millimetres; x right seen from the front, y up, z out of the face\n")
-        np.savetxt(file, mesh.vertices, fmt="v %.4f %.4f %.4f")
-        np.savetxt(file, mesh.uvs, fmt="vt %.6f %.6f")
-        np.savetxt(file, corners, fmt="f %d/%d %d/%d %d/%d")
+        for line, rows in (("v %.4f %.4f %.4f\n", mesh.vertices), ("vt %.6f %.6f\n", mesh.uvs),
+                           ("f %d/%d %d/%d %d/%d\n", corners)):
+            file.write(line * len(rows) % tuple(rows.ravel().tolist()))
 
 
 def read_obj(path: Path | str) -> Mesh:
-    """Reads v, vt and f; polygons are split into fans. A mesh without UVs gets one at the origin."""
-    vertices, uvs, faces, face_uvs = [], [], [], []
+    """Reads v, vt and f; polygons are split into fans. A mesh without UVs gets one at the origin. InputError for lines
+    that are no numbers, and as load_mesh."""
+    rows: dict[str, list[list[str]]] = {"v": [], "vt": [], "f": []}
     try:
         lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
     except FileNotFoundError as error:
         raise InputError("file is missing", where=str(path)) from error
     for line in lines:
         kind, *fields = line.split() or [""]
-        if kind == "v":
-            vertices.append([float(field) for field in fields[:3]])
-        elif kind == "vt":
-            uvs.append([float(field) for field in fields[:2]])
-        elif kind == "f":
-            corners = [[int(index) if index else 1 for index in (field.split("/") + ["1"])[:2]] for field in fields]
-            for k in range(1, len(corners) - 1):
-                fan = (corners[0], corners[k], corners[k + 1])
-                faces.append([corner[0] for corner in fan])
-                face_uvs.append([corner[1] for corner in fan])
-    if not vertices or not faces:
+        if kind in rows:
+            rows[kind].append(fields)
+    try:
+        vertices, uvs = _numbers(rows["v"], 3), _numbers(rows["vt"] or [["0", "0"]], 2)
+        corners = _fans(rows["f"])
+    except (ValueError, OverflowError) as error:
+        raise InputError("not a mesh that can be read", where=str(path), got=error) from error
+    if not len(vertices) or not len(corners):
         raise InputError("no vertices or no faces in the mesh", where=str(path))
-    uvs = np.array(uvs or [[0.0, 0.0]])
-    return _checked(
-        Mesh(np.array(vertices), _zero_based(faces, len(vertices)), uvs, _zero_based(face_uvs, len(uvs))), path
-    )
+    faces, face_uvs = (_zero_based(corners[..., k], count) for k, count in enumerate((len(vertices), len(uvs))))
+    return _checked(Mesh(vertices, faces, uvs, face_uvs), path)
 
 
-def _zero_based(indices: list[list[int]], count: int) -> np.ndarray:
-    indices = np.array(indices, np.int32)
+def _numbers(rows: list[list[str]], count: int) -> np.ndarray:
+    """The first count fields of each row [N, count]; ValueError where there are fewer, or others than numbers."""
+    fields = chain.from_iterable(row[:count] for row in rows)
+    return np.fromiter(map(float, fields), float).reshape(len(rows), count)
+
+
+def _fans(polygons: list[list[str]]) -> np.ndarray:
+    """Corners like 7, 7/3, 7/3/9 or 7//9 of polygons -> one-based vertex and UV of triangles, [F, 3, 2]."""
+    flat = list(chain.from_iterable(polygons))
+    known = {field: [int(index) if index else 1 for index in (field.split("/") + ["1"])[:2]] for field in set(flat)}
+    corners = np.array([known[field] for field in flat], np.int64).reshape(-1, 2)
+    sizes = np.array([len(polygon) for polygon in polygons], np.int64)
+    triangles = np.maximum(sizes - 2, 0)
+    first = np.repeat(np.cumsum(sizes) - sizes, triangles)
+    number = np.arange(triangles.sum()) - np.repeat(np.cumsum(triangles) - triangles, triangles)
+    return corners[np.stack([first, first + number + 1, first + number + 2], axis=1)]
+
+
+def _zero_based(indices: np.ndarray, count: int) -> np.ndarray:
     return np.where(indices < 0, indices + count, indices - 1).astype(np.int32)
 
 

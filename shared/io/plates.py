@@ -12,7 +12,7 @@ from shared.color import decode_transfer, encode_srgb
 from shared.errors import LimnError
 from shared.io.frames import FrameSet
 
-LONGEST_SIDE, QUALITY = 960, 88
+LONGEST_SIDE, QUALITY = 1024, 88
 
 
 def srgb_codes(frames: FrameSet) -> np.ndarray:
@@ -34,12 +34,13 @@ def write_plates(
     scale = min(1.0, LONGEST_SIDE / max(frames.size))
     size = tuple(max(1, round(side * scale)) for side in frames.size)
     for frame in progress(frame_index, "plates"):
-        picture = table[frames.read_codes(frames.position(int(frame)))]
+        codes = frames.read_codes(frames.position(int(frame)))
+        picture = cv2.LUT(codes, table) if codes.dtype == np.uint8 else table[codes]
         if scale < 1.0:
             picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
         written[int(frame)] = f"{int(frame):04d}.jpg"
         path = folder / written[int(frame)]
-        bgr = np.ascontiguousarray(picture[..., ::-1])
+        bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
         if not cv2.imwrite(str(path), bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY]):
             raise LimnError(f"{path}: could not be written")
     return written

@@ -11,8 +11,8 @@ from shared.color import encode_srgb
 
 ERROR_RANGE = 0.05
 """The error map runs from -ERROR_RANGE to +ERROR_RANGE of linear radiance, clip maximum 1."""
-_DARKER, _BRIGHTER = np.array([33, 102, 172.0]), np.array([178, 24, 43.0])
-_EQUAL, _NOTHING = np.array([247, 247, 247.0]), np.array([200, 200, 200.0])
+_DARKER, _BRIGHTER = np.float32([33, 102, 172]), np.float32([178, 24, 43])
+_EQUAL, _NOTHING = np.float32([247, 247, 247]), np.float32([200, 200, 200])
 
 
 def srgb_bytes(linear: np.ndarray) -> np.ndarray:

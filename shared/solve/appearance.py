@@ -22,7 +22,8 @@ import numpy as np
 import torch
 
 from shared.brdf import hemispherical_albedo
-from shared.lobes import LobeTable, specular_tables
+from shared.lobe_tables import specular_tables
+from shared.lobes import LobeTable
 from shared.solve.capture import Capture
 from shared.solve.light import FrameLight, LightPriors
 from shared.solve.light_models import LightModel, make_light_model

@@ -14,12 +14,12 @@ from scipy.spatial import cKDTree
 
 from shared.envmap import cube_from_latlong, latlong_directions, latlong_lookup
 from shared.gather import SurfaceViewer
-from shared.geometry import rigid, world_from_head
+from shared.geometry import camera_centres, rigid, world_from_head
 from shared.mesh import Mesh, interpolate, normalised
 from shared.raycast import camera_hits
 from shared.render import SurfaceMaps, render_frame
 from shared.shading import DEEP, Material, VertexShading
-from shared.solve.capture import Sizes, face_front, set_scenery, spread_frames
+from shared.solve.capture import Sizes, set_scenery, spread_frames
 from shared.split_sum import SplitSum
 from shared.studio_lights import STUDIO_LIGHTS, studio_light
 from shared.texture import sample_bilinear
@@ -30,6 +30,8 @@ DISTANCE_MM, FILLED = 900.0, 1.1
 """The virtual camera's distance from the head's middle, and the head's half diagonal in half pictures."""
 LIGHT_RESOLUTION, VIEW_SIZES = 16, Sizes(directions=640, nodes=500)
 ORIENTATION_MM = 40.0
+EDGE_COSINE = -0.1
+"""Vertices that turn away from a camera by more than this show in no triangle that it sees."""
 RELIT_YAW_DEG = -15.0
 HELD_OUT_SHOWN = 4
 """Held-out frames that the report re-renders beside the others."""
@@ -134,8 +136,7 @@ class HeadViews:
         self.viewer = SurfaceViewer.of(mesh)
         self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"])
         self.scenery = set_scenery(self.viewer, sizes or Sizes())
-        poses = [camera.camera_from_head for camera in cameras]
-        seen = face_front(self.viewer, np.stack(poses), -0.1) if poses else np.ones(len(mesh.vertices), bool)
+        seen = np.ones(len(mesh.vertices), bool) if not cameras else self._seen(cameras)
         self.index = np.nonzero(seen if only is None else seen & only)[0]
         self.points = mesh_points(mesh, self.index)
         wrap = progress or (lambda items, label: items)
@@ -144,6 +145,22 @@ class HeadViews:
         # What stands in for a point deep in a cavity is the nearest one in the open. Seen from inside the mouth that
         # can be the outside of the cheek, unless orientation counts as well.
         self._surface_place = np.concatenate([mesh.vertices, ORIENTATION_MM * self.viewer.normals], axis=1)
+        self._lit: VertexShading | None = None
+
+    def _seen(self, cameras: Sequence[Camera]) -> np.ndarray:
+        """[V] bool: vertices that some camera sees, and those around them, whose triangles reach into the open."""
+        seen = np.zeros(len(self.viewer.mesh.vertices), bool)
+        for camera in cameras:
+            towards = self._towards(camera, self.viewer.mesh.vertices)
+            front = np.nonzero((towards * self.viewer.normals).sum(1) > EDGE_COSINE)[0]
+            starts = self.viewer.mesh.vertices[front] + self.viewer.offset * self.viewer.normals[front]
+            seen[front[~self.viewer.scene.occluded(starts, towards[front])]] = True
+        return self.viewer.grown(seen)
+
+    @staticmethod
+    def _towards(camera: Camera, positions: np.ndarray) -> np.ndarray:
+        """[N, 3] unit vectors from the positions to the camera."""
+        return normalised(camera_centres(camera.camera_from_head[None])[0] - positions)
 
     def _material(self, mesh: Mesh, maps: Mapping[str, np.ndarray]) -> Material:
         """The maps at the nodes, for light that bounces, and the roughness at the traced points."""
@@ -165,20 +182,7 @@ class HeadViews:
         that the head covers in part are darker by the rest; else they show the mean of the part.
         """
         poses = np.stack([camera.camera_from_head for camera in cameras])
-        shading = VertexShading(
-            self.index,
-            self._surface_place,
-            self.points,
-            self.transfer,
-            self.scenery.node_transfer,
-            self.material,
-            np.maximum(cube_from_latlong(light, self.light_resolution), 0.0),
-            self.scenery.directions,
-            poses,
-            moves,
-            key_step=0.0,
-            deep=self.deep,
-        )
+        shading = self._shading(np.maximum(cube_from_latlong(light, self.light_resolution), 0.0), poses, moves)
         pictures = []
         for k, camera in enumerate(cameras):
             picture, covered = render_frame(
@@ -186,6 +190,26 @@ class HeadViews:
             )
             pictures.append(picture * covered[..., None] if fade else picture)
         return pictures
+
+    def _shading(self, light: np.ndarray, poses: np.ndarray, moves: str) -> VertexShading:
+        """Under a cubemap light; what no light changes is made once."""
+        if self._lit is None:
+            self._lit = VertexShading(
+                self.index,
+                self._surface_place,
+                self.points,
+                self.transfer,
+                self.scenery.node_transfer,
+                self.material,
+                light,
+                self.scenery.directions,
+                poses,
+                moves,
+                key_step=0.0,
+                deep=self.deep,
+            )
+            return self._lit
+        return self._lit.under(light, poses, moves)
 
     def coverage(self, camera: Camera, samples: int = 2) -> np.ndarray:
         """[h, w] in 0 .. 1: how much of each pixel the head covers, as render counts it."""
@@ -201,9 +225,8 @@ class HeadViews:
         """[h, w]: share of a lobe of this roughness about the reflected direction that the head leaves open; NaN beside
         the head. 1 where nothing covers it; for rough lobes it nears the sky's open share."""
         normals = self.points.normals
-        centre = -camera.camera_from_head[:3, 3] @ camera.camera_from_head[:3, :3]
-        towards = normalised(centre - self.points.positions)
-        facing = np.nonzero((towards * normals).sum(1) > 0.0)[0]
+        towards = self._towards(camera, self.points.positions)
+        facing = np.nonzero(((towards * normals).sum(1) > 0.0) & self._seen([camera])[self.index])[0]
         share = np.ones(len(self.viewer.mesh.vertices))
         visible = self.transfer.visibility(facing)
         share[self.index[facing]] = SplitSum(self.scenery.directions).visible_share(

@@ -1,0 +1,49 @@
+"""Meshes of other programs: what of Wavefront's format is read, and what is refused with one line."""
+
+import numpy as np
+import pytest
+from shapes import sphere
+
+from shared.errors import InputError
+from shared.io.meshes import read_obj, write_obj
+
+CORNERS = "v 0 0 0\nv 1 0 0 0.5 0.5 0.5\nv 1 1 0\nv 0 1 0\nv 0 2 0\nvt 0 0\nvt 1 0\nvt 1 1 0\nvt 0 1\n"
+
+
+def read(folder, text):
+    (folder / "mesh.obj").write_text(text)
+    return read_obj(folder / "mesh.obj")
+
+
+def test_what_is_written_comes_back(tmp_path):
+    ball = sphere(3.0)
+    write_obj(tmp_path / "mesh.obj", ball)
+    back = read_obj(tmp_path / "mesh.obj")
+    assert np.allclose(back.vertices, ball.vertices, atol=1e-4) and np.allclose(back.uvs, ball.uvs, atol=1e-6)
+    assert (back.faces == ball.faces).all() and (back.face_uvs == ball.face_uvs).all()
+
+
+def test_polygons_become_fans(tmp_path):
+    mesh = read(tmp_path, CORNERS + "# a comment\nusemtl skin\nf 1/1 2/2 3/3 4/4\nf 1/1 2/2\nf 3/3/1 4/4/1 5/4/1\n")
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [2, 3, 4]]
+    assert mesh.face_uvs.tolist() == [[0, 1, 2], [0, 2, 3], [2, 3, 3]]
+    assert mesh.vertices[1].tolist() == [1.0, 0.0, 0.0] and mesh.uvs[2].tolist() == [1.0, 1.0]
+
+
+def test_indices_may_count_from_the_end_and_uvs_be_left_out(tmp_path):
+    mesh = read(tmp_path, CORNERS + "f -5 -4//1 -3/\n")
+    assert mesh.faces.tolist() == [[0, 1, 2]] and mesh.face_uvs.tolist() == [[0, 0, 0]]
+
+
+@pytest.mark.parametrize("text, message", [
+    ("v 0 0 0\n", "no vertices or no faces"),
+    (CORNERS + "f 1 2\n", "no vertices or no faces"),
+    (CORNERS + "f 1 2 9\n", "point outside"),
+    (CORNERS + "f 1 2 99999999999999999999\n", "not a mesh"),
+    (CORNERS + "f 1 2 three\n", "not a mesh"),
+    ("v 0 0\n" + CORNERS + "f 1 2 3\n", "not a mesh"),
+    ("v 0 0 zero\n" + CORNERS + "f 1 2 3\n", "not a mesh"),
+])
+def test_what_cannot_be_read_is_one_line(tmp_path, text, message):
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, text)
