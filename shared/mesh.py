@@ -66,14 +66,20 @@ def uniform_laplacian(faces: np.ndarray, count: int) -> sparse.csr_matrix:
     return (sparse.identity(count) - sparse.diags(1.0 / degree) @ adjacency).tocsr()
 
 
+def unique_pairs(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """[N, 2] indices -> distinct pairs [U, 2] in order, which of them each is [N], how often each occurs [U]."""
+    count = int(pairs.max(initial=0)) + 1
+    # One number for a pair sorts many times faster than rows do.
+    keys, inverse, occurs = np.unique(pairs.astype(np.int64) @ [count, 1], return_inverse=True, return_counts=True)
+    return np.stack(np.divmod(keys, count), axis=1), inverse.ravel(), occurs
+
+
 def mesh_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """[F, 3] -> edges [E, 2] with the lower vertex first, in order; edge of each corner pair (01, 12, 20) [F, 3]; how
     many faces share each edge [E]."""
-    pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2).astype(np.int64)
-    count = int(pairs.max(initial=0)) + 1
-    # One number for a pair sorts many times faster than rows do.
-    keys, inverse, shared = np.unique(pairs @ [count, 1], return_inverse=True, return_counts=True)
-    return np.stack(np.divmod(keys, count), axis=1), inverse.reshape(-1, 3), shared
+    pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
+    edges, edge, shared = unique_pairs(pairs)
+    return edges, edge.reshape(-1, 3), shared
 
 
 def _split(faces: np.ndarray, face_edges: np.ndarray, count: int) -> np.ndarray:

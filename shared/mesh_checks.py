@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.mesh import Mesh, face_normals
+from shared.mesh import Mesh, face_normals, mesh_edges, unique_pairs
 
 MAXIMUM_DEGENERATE = 0.01
 """Share of faces without area above which a mesh counts as broken rather than untidy."""
@@ -66,6 +66,4 @@ def degenerate_faces(mesh: Mesh) -> np.ndarray:
 def non_manifold_edges(faces: np.ndarray) -> tuple[int, int]:
     """[F, 3] -> edges with more than two faces; edges that two faces walk in the same direction."""
     directed = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-    _, shared = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
-    _, repeated = np.unique(directed, axis=0, return_counts=True)
-    return int((shared > 2).sum()), int((repeated > 1).sum())
+    return int((mesh_edges(faces)[2] > 2).sum()), int((unique_pairs(directed)[2] > 1).sum())

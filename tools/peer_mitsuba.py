@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from shared.geometry import invert_rigid
-from shared.mesh import Mesh, vertex_normals
+from shared.mesh import Mesh, unique_pairs, vertex_normals
 from shared.solve.views import Camera
 
 VARIABLE = "LIMN_MITSUBA_VARIANT"
@@ -118,7 +118,7 @@ def _bsdf(coat: Coat) -> dict:
 
 def _ply(mesh: Mesh) -> bytes:
     """Binary PLY with the vertex normals that our renderer shades with; vertices at seams of the texture twice."""
-    corners, corner = np.unique(np.stack([mesh.faces.ravel(), mesh.face_uvs.ravel()], 1), axis=0, return_inverse=True)
+    corners, corner, _ = unique_pairs(np.stack([mesh.faces.ravel(), mesh.face_uvs.ravel()], 1))
     header = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {len(corners)}\n"
         + "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz", "u", "v"))

@@ -23,7 +23,7 @@ from shared.errors import LimnError
 from shared.io.export_maps import integer_codes
 from shared.io.usd_capture import Capture, world_from_head_rigid, world_from_usd_camera
 from shared.io.usd_geometry import shading_normals
-from shared.mesh import Mesh
+from shared.mesh import Mesh, unique_pairs
 
 METRES_PER_MM = 0.001
 _FLOAT, _UINT = 5126, 5125
@@ -100,15 +100,14 @@ def write_glb(path: Path | str, name: str, mesh: Mesh, maps: Mapping[str, np.nda
 
 def _primitive(buffer: _Buffer, mesh: Mesh) -> dict:
     """glTF knows one index per corner: vertices are doubled along texture seams."""
-    pairs = np.column_stack([mesh.faces.ravel(), mesh.face_uvs.ravel()])
-    corners, index = np.unique(pairs, axis=0, return_inverse=True)
+    corners, index, _ = unique_pairs(np.column_stack([mesh.faces.ravel(), mesh.face_uvs.ravel()]))
     vertex, coordinate = corners.T
     attributes = {
         "POSITION": buffer.array(mesh.vertices[vertex] * METRES_PER_MM, _ARRAY, bounds=True),
         "NORMAL": buffer.array(shading_normals(mesh)[vertex], _ARRAY),
         "TEXCOORD_0": buffer.array(mesh.uvs[coordinate] * [1.0, -1.0] + [0.0, 1.0], _ARRAY),
     }
-    return {"attributes": attributes, "indices": buffer.array(index.ravel().astype(np.uint32), _INDEX), "material": 0}
+    return {"attributes": attributes, "indices": buffer.array(index.astype(np.uint32), _INDEX), "material": 0}
 
 
 def _material(buffer: _Buffer, maps: Mapping[str, np.ndarray]) -> tuple[list[int], dict]:
