@@ -104,9 +104,8 @@ def background_of(shape: tuple[int, int], person: np.ndarray, window: tuple[int,
     shoulders; below the window is the body."""
     x0, y0, x1, y1 = window
     reach = max(1, round(PERSON_MARGIN * (x1 - x0)))
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     background = np.ones(shape, bool)
-    background[y0:y1, x0:x1] = cv2.dilate((person > 0.3).astype(np.uint8), disc) == 0
+    background[y0:y1, x0:x1] = cv2.distanceTransform((person <= 0.3).astype(np.uint8), cv2.DIST_L2, 5) > reach
     background[y1:, x0:x1] = False
     return background
 

@@ -160,9 +160,9 @@ class ClipSurvey:
 
     def background_drift(self, positions: np.ndarray, width: int, height: int) -> float:
         """See frame_quality.background_drift; background is what no head or body ever covers at `positions`."""
-        still = np.ones((PROXY_HEIGHT, PROXY_WIDTH), bool)
+        still, face = np.ones((PROXY_HEIGHT, PROXY_WIDTH), bool), self.main_face
         for i in positions:
-            x0, y0, x1, _ = head_window(self.main_face.observations[int(i)], width, height)
+            x0, y0, x1, _ = head_window(face.observations[int(i)], width, height)
             left, right = int(x0 / width * PROXY_WIDTH), int(np.ceil(x1 / width * PROXY_WIDTH))
             still[int(y0 / height * PROXY_HEIGHT):, left:right] = False
         return background_drift(self.proxies[positions], still)

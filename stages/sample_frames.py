@@ -3,7 +3,7 @@
 Reads    the subject's video (or numbered images), lens and transfer function.
 Writes   frames.json, frames/%06d.png (the crop in the source's own code values), masks/%06d.png, contact_sheet.png;
          chart.png where a colour chart is in view.
-Method   A first pass looks at up to four times as many frames as wanted, in small: follows the faces, and measures
+Method   A first pass looks at several times as many frames as wanted, in small: follows the faces, and measures
          sharpness and change against the neighbours. Faulty, black, alien, faceless, repeated and blurred frames go,
          each with its reason; the rest is thinned to an even spacing in time. One crop holds the whole head in all of
          them. A second pass decodes just these frames in full, and looks for a colour chart in a dozen of them. Codes
@@ -34,6 +34,8 @@ STAGE = Stage(
     parameters=(
         Parameter("frame_count", int, 150, "Frames to keep at most.", "frames", 3, 2000),
         Parameter("max_size", int, 1024, "Longest side of the crop; larger ones are scaled down.", "px", 128, 4096),
+        Parameter("candidates", int, 4, "Frames to look at for each that is kept, where the clip has so many.", "",
+                  1, 100),
         Parameter("blurred_below", float, 0.4, "Frames less sharp than this share of their neighbours are dropped.",
                   "", 0.0, 1.0),
     ),
@@ -56,7 +58,8 @@ def run(job: Job) -> None:
     reader, networks = open_video(subject.video), load_face_networks()
     info = reader.info
     chart = watch_for_chart(reader, job)
-    survey = survey_clip(reader, networks, subject.transfer, params.frame_count, job.progress)
+    candidates = params.frame_count * params.candidates
+    survey = survey_clip(reader, networks, subject.transfer, candidates, job.progress)
     selection = select_frames(survey, info, str(subject.video), frame_count=params.frame_count,
                               max_size=params.max_size, blurred_below=params.blurred_below,
                               moves=subject.moves)

@@ -25,7 +25,10 @@ from shared.io.source import (
 )
 
 KINDS = ".png .tif .tiff .jpg .jpeg .exr"
-_FORMATS = "png_pipe,tiff_pipe,jpeg_pipe,image2"
+_DECODERS = {b"\x89PNG\r\n": "png", b"II*\0": "tiff", b"MM\0*": "tiff", b"\xff\xd8\xff": "mjpeg"}
+"""First bytes -> FFmpeg's name."""
+LARGEST_FILE = 16 * MAX_PIXELS
+"""Bytes: twice the largest picture, 16 bits and four channels, as it is in memory."""
 _COUNTER = re.compile(r"%(?:0?\d+)?d")
 
 
@@ -70,12 +73,13 @@ class ImageSequenceReader:
     def __iter__(self) -> Iterator[tuple[int, np.ndarray]]:
         return ((frame.index, frame.codes()) for frame in self.frames())
 
-    def frames(self, indices: Collection[int] | None = None) -> Iterator[SourceFrame]:
-        """Frames by rising index, all of them or only those of `indices`; numbers without a file are left out."""
+    def frames(self, indices: Collection[int] | None = None, step: int = 1) -> Iterator[SourceFrame]:
+        """Frames by rising index, every step-th of them or only those of `indices`; numbers without a file are left
+        out."""
         wanted = None if indices is None else frozenset(indices)
         for number in sorted(self._files):
             index = number - self._first_number
-            if wanted is None or index in wanted:
+            if index % step == 0 if wanted is None else index in wanted:
                 yield self._checked(self._read(index, self._files[number]))
 
     def _checked(self, frame: SourceFrame) -> SourceFrame:
@@ -95,11 +99,8 @@ class ImageSequenceReader:
         if _is_exr(file):
             return _read_linear_exr(index, time_s, file)
         try:
-            with av.open(f"file:{file}", options={"protocol_whitelist": "file", "format_whitelist": _FORMATS}) as image:
-                context = image.streams.video[0].codec_context
-                check_size(context.width, context.height, str(file))
-                context.options = {"max_pixels": str(MAX_PIXELS)}
-                picture = next(image.decode(video=0))
+            picture = _decoded(file)
+            check_size(picture.width, picture.height, str(file))
         except InputError as error:
             return SourceFrame(index, time_s, error.what)
         except (av.error.FFmpegError, OSError, StopIteration, IndexError):
@@ -110,6 +111,19 @@ class ImageSequenceReader:
 
 def _is_exr(file: Path) -> bool:
     return file.suffix.lower() == ".exr"
+
+
+def _decoded(file: Path) -> av.VideoFrame:
+    """The picture of a file, by its first bytes; StopIteration where they are none of _DECODERS.
+
+    Without a container: that would decode the picture once more, to find out about its format.
+    """
+    if file.stat().st_size > LARGEST_FILE:
+        raise InputError("the file is too large", where=str(file))
+    data = file.read_bytes()
+    context = av.CodecContext.create(next(name for start, name in _DECODERS.items() if data.startswith(start)), "r")
+    context.options, context.thread_count = {"max_pixels": str(MAX_PIXELS)}, 1
+    return (context.decode(av.Packet(data)) or context.decode(None))[0]
 
 
 def _read_linear_exr(index: int, time_s: float, file: Path) -> SourceFrame:

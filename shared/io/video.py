@@ -69,11 +69,11 @@ class VideoReader:
     def __iter__(self) -> Iterator[tuple[int, np.ndarray]]:
         return ((frame.index, frame.codes()) for frame in self.frames())
 
-    def frames(self, indices: Collection[int] | None = None) -> Iterator[SourceFrame]:
-        """Frames in the order they are shown, all of them or only those of `indices`.
+    def frames(self, indices: Collection[int] | None = None, step: int = 1) -> Iterator[SourceFrame]:
+        """Frames in the order they are shown, every step-th of them or only those of `indices`.
 
-        A frame is valid until the next one is asked for. Reading all of them ends with InputError where far fewer
-        decode than the file states.
+        A frame is valid until the next one is asked for. Without `indices` the whole clip is decoded, which ends with
+        InputError where far fewer frames do than the file states.
         """
         wanted = None if indices is None else frozenset(indices)
         last = max(wanted, default=-1) if wanted is not None else None
@@ -86,7 +86,7 @@ class VideoReader:
                     return
                 start = picture.pts if start is None else start
                 time_s = self._time(picture, start, time_s)
-                if wanted is None or count in wanted:
+                if count % step == 0 if wanted is None else count in wanted:
                     yield DecodedFrame(count, time_s, self._fault(picture), picture, reformatter, self._quarter_turns)
                 count += 1
                 check_length(count, str(self.path))

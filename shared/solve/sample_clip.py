@@ -18,7 +18,6 @@ from shared.io.video import VideoReader
 from shared.landmarks import FaceNetworks
 from shared.read_ahead import read_ahead
 
-CANDIDATES_PER_FRAME = 4
 ANALYSIS_SIZE_PX = 1280
 MASKS_IN_SURVEY = 30
 MIN_FRAMES, FEW_FRAMES = 3, 30
@@ -48,21 +47,20 @@ class Selection:
     summary: str
 
 
-def survey_clip(reader: VideoReader | ImageSequenceReader, networks: FaceNetworks, transfer: str, frame_count: int,
+def survey_clip(reader: VideoReader | ImageSequenceReader, networks: FaceNetworks, transfer: str, candidates: int,
                 progress: Progress) -> ClipSurvey:
-    """The first pass over the clip, looking at up to 4 x frame_count evenly spaced frames at 1280 px or less."""
+    """The first pass over the clip, looking at about `candidates` evenly spaced frames at 1280 px or less."""
     count = reader.info.frame_count
-    stride = max(1, count // (CANDIDATES_PER_FRAME * frame_count))
+    stride = max(1, count // candidates)
     size = analysis_size(reader.info)
     survey = ClipSurvey(networks, mask_every=max(1, count // stride // MASKS_IN_SURVEY))
 
     def look(frame: SourceFrame) -> tuple[SourceFrame, np.ndarray | None]:
-        unseen = frame.fault or frame.index % stride
-        return frame, None if unseen else display_codes(frame.codes(size), transfer)
+        return frame, None if frame.fault else display_codes(frame.codes(size), transfer)
 
-    for frame, rgb in progress(read_ahead(map(look, reader.frames())), "looking for faces", total=count):
-        if frame.index % stride == 0:
-            survey.add(frame.index, frame.time_s, rgb, frame.fault)
+    looks = read_ahead(map(look, reader.frames(step=stride)))
+    for frame, rgb in progress(looks, "looking for faces", total=-(-count // stride)):
+        survey.add(frame.index, frame.time_s, rgb, frame.fault)
     return survey
 
 
