@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from quadrature import hemisphere_quadrature
 
 from shared.brdf import (
     F0,
     directional_albedo,
     ggx_distribution,
-    hemisphere_quadrature,
     hemispherical_albedo,
     microfacet_integrals,
     schlick_fresnel,

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from quadrature import hemisphere_quadrature
 from shapes import grid_plane, sphere
 
-from shared.brdf import directional_albedo, hemisphere_quadrature, specular_cosine
+from shared.brdf import directional_albedo, specular_cosine
 from shared.envmap import cube_directions, cube_solid_angles
 from shared.gather import (
     SurfaceViewer,

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from quadrature import hemisphere_quadrature
 
-from shared.brdf import directional_albedo, hemisphere_quadrature, microfacet_integrals, specular_cosine
+from shared.brdf import directional_albedo, microfacet_integrals, specular_cosine
 from shared.geometry import fibonacci_sphere
 from shared.lobes import LobeTable, specular_reflection
 from shared.mesh import normalised

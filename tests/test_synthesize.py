@@ -7,6 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from brute_force import reference_radiance
+from quadrature import hemisphere_quadrature
 
 from shared import brdf
 from shared.chart import CORNERS, reflectances
@@ -25,7 +27,6 @@ from tools.synth_head import DRIFT_DEG, YAW_DEG, head_turn
 from tools.synth_irradiance import IrradianceQuality, Shot, assemble_atlas, group_irradiance
 from tools.synth_light import ENVIRONMENTS, EnvironmentLight, procedural_environment
 from tools.synth_output import ClipWriter, rounded, sensor_codes
-from tools.synth_reference import reference_radiance
 from tools.synth_render import RenderQuality, Scene, render
 from tools.synth_sampling import shifted_hammersley
 from tools.synth_surface import Materials, Surface
@@ -116,7 +117,7 @@ def test_lobe_samples_integrate_to_the_directional_albedo():
 def test_gloss_of_a_lit_globe_matches_a_numeric_integral():
     light = EnvironmentLight(procedural_environment("studio", 3))
     surface = Surface(round_mesh(80.0, np.pi, inward=False), plain())
-    directions, solid_angle = brdf.hemisphere_quadrature(96, 192)
+    directions, solid_angle = hemisphere_quadrature(96, 192)
     rng = np.random.default_rng(0)
     samples = GlossSamples.draw(light, np.eye(3), 256, 256, rng)
     face = rng.integers(len(surface.mesh.faces), size=40)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from shared.contract.folders import RunFolder
 from shared.contract.manifest import outputs_digest, read_manifest, read_record, write_record
-from shared.contract.pipeline import Gate, Pipeline
+from shared.contract.pipeline import Pipeline
 from shared.contract.wording import unknown_name
 
 if TYPE_CHECKING:
@@ -110,11 +110,6 @@ def judge(run: RunFolder, pipeline: Pipeline) -> list[Flag]:
     write_record(run.work / RECORD, {"gates": asked, "results": results, "values": values,
                                      "flags": [asdict(flag) for flag in flags]})
     return flags
-
-
-def limits_of(gates: Mapping[str, Gate]) -> str:
-    """All thresholds in words."""
-    return ", ".join(f"{name} {gate.limit}" for name, gate in gates.items())
 
 
 def confidence_map(run: RunFolder) -> Path:

@@ -17,7 +17,6 @@ from shared.mesh import Mesh
 from tools.synth_camera import Camera
 from tools.synth_render import Scene
 
-BUFFERS = ("albedo", "normal", "specular", "roughness", "depth")
 COVERAGES = ("mask", "head")
 SMALL_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 9, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_FILTERED)
 COLOURS = ("radiance", "albedo")

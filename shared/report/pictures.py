@@ -60,11 +60,6 @@ def jpeg_uri(picture: np.ndarray, quality: int = 85) -> str:
     return _uri("jpeg", ".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
-def png_uri(picture: np.ndarray) -> str:
-    """uint8 [H, W] or [H, W, 3] RGB -> data URI, lossless."""
-    return _uri("png", ".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-
-
 def _uri(kind: str, suffix: str, picture: np.ndarray, options: list[int]) -> str:
     ordered = np.ascontiguousarray(picture[..., ::-1] if picture.ndim == 3 else picture)
     _, encoded = cv2.imencode(suffix, ordered, options)
