@@ -1,8 +1,12 @@
 """The README says what the code says."""
 
+import importlib
 import re
 from pathlib import Path
 
+import pytest
+
+from shared.contract.pipeline import load_pipeline
 from tools.readme import README, SCORES, cost_table, with_tables
 
 
@@ -24,6 +28,13 @@ def test_costs_are_listed_by_rising_cost_without_ablations():
     assert len(table) == 6 and table[2].startswith("| quick | 10 | 9 |  | 300 MB | 1.00 | 1.0 |")
     assert table[3].startswith("| slow | 10 | 90 | 20 | 300 MB")
     assert table[5].startswith("Medians of 1, from the clip to the maps, on 2 cores; other work kept 0.0 cores")
+
+
+@pytest.mark.parametrize("stage", load_pipeline().steps)
+def test_every_file_of_every_stage_is_explained(stage):
+    text = (Path(README).parent / "docs" / "files.md").read_text(encoding="utf-8")
+    for output in importlib.import_module(f"stages.{stage}").STAGE.outputs:
+        assert any(f"`{output.path.replace('*', number)}`" in text for number in ("*", "%06d", "%04d")), output.path
 
 
 def test_every_local_link_leads_somewhere():
