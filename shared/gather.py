@@ -8,6 +8,7 @@ and "at most" (censored data), which still bounds the model.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import cv2
@@ -20,7 +21,9 @@ from shared.raycast import RayScene
 
 CLIPPED_CODE = 0.98
 CRUSHED_CODE = 0.012
-MINIMUM_VIEW_COSINE = 0.2
+MINIMUM_VIEW_COSINE, MAXIMUM_LEAST_COSINE = 0.2, 0.5
+BALL_MM = 60.0
+"""A head is as round as a ball of this radius where it curves away from the camera."""
 _REMAP_COLUMNS = 1024
 
 
@@ -72,6 +75,7 @@ class SurfaceViewer:
 
     def __init__(self, mesh: Mesh, scene: RayScene, margin_mm: float = 2.0, offset: float = 0.05):
         self.mesh, self.scene, self.offset = mesh, scene, offset
+        self.least_cosine = MINIMUM_VIEW_COSINE
         self.normals = vertex_normals(mesh.vertices, mesh.faces)
         faces = mesh.faces
         edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -86,6 +90,14 @@ class SurfaceViewer:
         """With a scene of the mesh alone."""
         return cls(mesh, RayScene(mesh.vertices, mesh.faces))
 
+    def within_rim(self, error_mm: float) -> SurfaceViewer:
+        """The same for a surface that may be off by error_mm: it leaves out what is so close to the rim that the
+        picture may show there what lies behind. At cosine c a ball of radius R lies R c^2 / 2 within its rim."""
+        viewer = copy(self)
+        rim = np.sqrt(4.0 * error_mm / BALL_MM)
+        viewer.least_cosine = float(np.clip(rim, MINIMUM_VIEW_COSINE, MAXIMUM_LEAST_COSINE))
+        return viewer
+
     def view(self, camera_from_head: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]) -> View:
         """All vertices in one camera. size: (width, height) of the picture in pixels."""
         vertices = self.mesh.vertices
@@ -95,7 +107,7 @@ class SurfaceViewer:
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         cosine = (towards * self.normals).sum(1)
         within = ((pixels > 1.0) & (pixels < np.array(size) - 1.0)).all(1) & (depth > 0)
-        seen = within & (cosine > MINIMUM_VIEW_COSINE)
+        seen = within & (cosine > self.least_cosine)
         index = np.nonzero(seen)[0]
         origins = vertices[index] + self.offset * self.normals[index]
         hidden = index[self.scene.occluded(origins, towards[index])]

@@ -25,7 +25,7 @@ from shared.solve.light_models import SeveralLights
 from shared.solve.maps import make_maps
 from shared.solve.normal_map import NormalPass, resolved_texels
 from shared.solve.reference_clip import solve_by_reference
-from shared.solve.reshape import meet_outline
+from shared.solve.reshape import meet_outline, surface_error
 from shared.solve.texture_pass import Clip, TexturePass
 from shared.texels import TexelSurface
 
@@ -52,7 +52,7 @@ def solve_clip(
     light = int(inputs.light_index[sights[0].frame]) if sights else 0
     chart, warning = state_chart(sights, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves, light)
     lit = solve_light(inputs, settings, viewer, fitted, chart, progress, note)
-    inputs, settings, viewer = lit.inputs, lit.settings, lit.viewer
+    inputs, settings, viewer = lit.inputs, lit.settings, lit.viewer.within_rim(surface_error(lit.inputs.tracks))
     signs, solution = examine(lit)
     shading = shade_vertices(inputs, settings.appearance, viewer, lit.scenery, solution, progress)
     surface = TexelSurface(inputs.mesh, settings.map_size)

@@ -19,6 +19,8 @@ OUTLINED = ("forehead", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "
 """Segments that may form the outline. The neck bends, and clothes cover it."""
 TRACK_REACH_MM = 6.0
 """So far around a track point the tracks tell the surface better than an outline does."""
+MODEL_ERROR_MM = 2.0
+"""How far a fitted head model lies from a head."""
 TRACK_FLOOR_MM = 0.1
 """Error of a track point that more frames or sharper pictures do not lessen."""
 
@@ -56,6 +58,14 @@ def faces_of(inputs, names: tuple[str, ...]) -> np.ndarray:
 def track_points(positions: np.ndarray, sigma_mm: np.ndarray) -> TrackPoints:
     """Track points [N, 3] with the standard deviation of their depth [N]."""
     return TrackPoints(positions, np.hypot(TRACK_FLOOR_MM, sigma_mm))
+
+
+def surface_error(tracks: tuple[np.ndarray, np.ndarray] | None) -> float:
+    """How far the head's surface may be off, mm, given how far the depth of its track points may, and what the head
+    model knows without them; 0: the mesh is not from tracks."""
+    if tracks is None:
+        return 0.0
+    return float(1.0 / np.hypot(1.0 / np.median(track_points(*tracks).sigma_mm), 1.0 / MODEL_ERROR_MM))
 
 
 def meet_outline(inputs, frames: tuple[np.ndarray, np.ndarray], settings: RimSettings, note: Callable):
