@@ -6,12 +6,12 @@ Writes   maps/*.exr, envmap.exr, mesh.npz, shape.png, poses.npz, renders/*.exr, 
 Method   What no track reaches (ears, skull, jaw) moves until the mesh's outline meets the border of the person masks.
          In head space a surface point's view of the sphere never changes, so visibility and bounces are traced once
          and reused by all frames. Light by Gauss-Newton with the albedo eliminated, specular intensity in closed form,
-         roughness by line search, stopping on held-out frames. Under that light the mesh is refined from parallax and
-         shading by Gauss-Newton, coarse to fine, the light solved anew, and the refined mesh kept if held-out frames
-         fit better. Or (model=auto) the model is chosen first, on few points and frames: shared/solve/ladder.py. Then
-         albedo and specular intensity per texel in closed form, streaming over the frames. The solver starts from a
-         uniform light and the priors: of one clip it needs no start from init_albedo, which is an input for comparison
-         only.
+         roughness by line search, stopping on held-out frames; a prior on how skin varies over a face keeps the
+         colours of a room out of the albedo. Under that light the mesh is refined from parallax and shading by
+         Gauss-Newton, coarse to fine, the light solved anew, and the refined mesh kept if held-out frames fit better.
+         Or (model=auto) the model is chosen first, on few points and frames: shared/solve/ladder.py. Then albedo and
+         specular intensity per texel in closed form, streaming over the frames. The solver starts from a uniform light
+         and the priors: of one clip it needs no start from init_albedo, which is an input for comparison only.
          Or (solver=reference) as published: shared/solve/reference.py.
          Several clips of one head under different lights are solved as one (shared/solve/joint_clips.py): one mesh and
          one set of maps, a light and poses of each. What lies at the top is the first clip's then, and clips/ holds
@@ -33,7 +33,7 @@ LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 STAGE = Stage(
     name="inverse_render",
-    version=9,
+    version=10,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -81,6 +81,9 @@ STAGE = Stage(
                   "", 0.01, 2.0),
         Parameter("white_light", float, 0.15, "Expected deviation of the light's log colour ratios from grey.", "",
                   0.01, 2.0),
+        Parameter("skin_brightness", float, 0.2, "Expected deviation of the log albedo's brightness at large scale "
+                  "over the skin of a face.", "", 0.01, 10.0),
+        Parameter("skin_colour", float, 0.1, "The same of its colour, per channel about their mean.", "", 0.01, 10.0),
         Parameter("light_smoothness", float, 1.0, "Weight of the light's smoothness.", "", 0.0, 1000.0),
         Parameter("evidence", float, 5000.0, "How many independent samples the clip counts as.", "", 10.0, 1e7),
         Parameter("chart", bool, True, "Take the light's scale from the colour chart that sample_frames found."),

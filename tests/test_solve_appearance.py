@@ -98,9 +98,12 @@ def test_residuals_come_down_to_the_noise(solution):
     assert 0.25 <= solution.state.roughness <= 0.7
 
 
-def test_the_best_held_out_state_wins(solution):
-    candidates = [record["held_out"] for record in solution.iterations[SHAPING_STEPS:]]
-    assert solution.held_out == min(candidates)
+def test_the_best_held_out_state_wins(truth, solution):
+    """Where the prior on skin has nothing against it."""
+    count = Settings().independent * (~truth[0].fitted).mean()
+    judged = [record["held_out"] * np.sqrt(1.0 + 2.0 * record["skin_prior"] / count)
+              for record in solution.iterations[SHAPING_STEPS:]]
+    assert solution.held_out == solution.iterations[SHAPING_STEPS + int(np.argmin(judged))]["held_out"]
     assert solution.iterations[0]["held_out"] > 2.0 * solution.held_out
 
 

@@ -9,7 +9,7 @@ from shared.geometry import rigid, rotation_from_vector
 from shared.mesh import interpolate
 from shared.raycast import RayScene, camera_hits
 from shared.solve.maps import make_maps
-from shared.solve.texture import Noise, NormalEquations, pooled_specular, robust_weight
+from shared.solve.texture import PRIOR_SPREAD, BorderSums, Noise, NormalEquations, pooled_specular, robust_weight
 from shared.solve.texture_pass import Clip, TexturePass
 from shared.texels import TexelSamples, TexelSurface, smooth_field
 from shared.texture import sample_bilinear
@@ -109,6 +109,15 @@ def test_what_is_left_of_a_mostly_clipped_texel_says_little():
     whole = accumulated(*frames).information(np.full(3, 0.9), NEVER_WRONG)
     assert (found[:, 0] < 0.5 * alone[:, 0]).all()
     assert np.allclose(found[:, 1:], whole[:, 1:])
+
+
+def test_what_is_only_seen_near_the_heads_border_says_little():
+    """However many frames show it; one good view among many poor ones is enough."""
+    sums, cosines = BorderSums(3), np.array([[0.22, 0.9, 0.22]] * 40 + [[0.22, 0.9, 0.95]] * 20)
+    for row in cosines:
+        sums.add(TexelSamples(np.arange(3), np.full((3, 3), 0.3), row**2, np.zeros((3, 3), np.int8)))
+    share = PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + sums.variance())
+    assert share[0] < 0.6 and share[1] > 0.99 and share[2] > 0.97
 
 
 def test_robust_weights():

@@ -35,10 +35,10 @@ def true_albedo(positions):
     return np.array([0.50, 0.31, 0.23]) * np.exp(pattern)[:, None]
 
 
-def swinging(frames=FRAMES):
-    """A head that turns 35 degrees to both sides and nods."""
+def swinging(frames=FRAMES, turn=0.6):
+    """A head that turns 35 degrees (turn, in radians) to both sides and nods."""
     angle = np.linspace(0, 2 * np.pi, frames)
-    vectors = np.stack([0.25 * np.sin(2 * angle), 0.6 * np.sin(angle), 0 * angle], axis=1)
+    vectors = turn * np.stack([0.4 * np.sin(2 * angle), np.sin(angle), 0 * angle], axis=1)
     return rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors), np.tile([0, 0, 900.0], (frames, 1)))
 
 
@@ -53,21 +53,30 @@ def hard_light(directions):
     return 0.15 + 40.0 * lamp[:, None] * np.array([1.0, 0.95, 0.9])
 
 
+def coloured_light(directions):
+    """A room whose left is red and whose right is green, grey in between."""
+    side = directions[:, :1]
+    return np.exp(0.4 * directions[:, 1:2] + side * np.array([-0.5, 0.4, 0.1]))
+
+
 def make_truth(
-    specular=SPECULAR, clip_at=np.inf, roughness_at=lambda positions: ROUGHNESS, lights=(true_light,), noise=NOISE
+    specular=SPECULAR, clip_at=np.inf, roughness_at=lambda positions: ROUGHNESS, lights=(true_light,), noise=NOISE,
+    poses=None, moves="head", true_albedo=true_albedo,
 ):
     """Capture, true albedo [P, 3] and true irradiance [P, F, 3], put together from the forward modules.
 
-    roughness_at: of points [P, 3], one value or [P]; lights: functions of directions, FRAMES frames in each.
+    roughness_at: of points [P, 3], one value or [P]; lights: functions of directions, FRAMES frames in each; poses
+    [FRAMES, 4, 4] or None: swinging; true_albedo: of points.
     """
     mesh = toy_head(4).mesh(np.zeros(2), np.zeros(1))
     scene, nodes = RayScene(mesh.vertices, mesh.faces), bounce_nodes(mesh, 80)
-    poses, light_index = np.tile(swinging(), (len(lights), 1, 1)), np.repeat(np.arange(len(lights)), FRAMES)
+    poses = swinging() if poses is None else poses
+    poses, light_index = np.tile(poses, (len(lights), 1, 1)), np.repeat(np.arange(len(lights)), FRAMES)
     frames = len(poses)
     front = np.nonzero(mesh.vertices[:, 2] > 15.0)[0]
     points = mesh_points(mesh, front)
     transfer, node_transfer = (trace_transfer(scene, some, nodes, DIRECTIONS) for some in (points, nodes.points))
-    turns = world_from_head(poses, "head")
+    turns = world_from_head(poses, moves)
     cubes = np.concatenate([light(cube_directions(16)) for light in lights])
     along = light_along(cubes, DIRECTIONS, turns, light_index)
     node_albedo = true_albedo(nodes.points.positions) + specular * hemispherical_albedo(ROUGHNESS)

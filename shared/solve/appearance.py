@@ -29,6 +29,7 @@ from shared.solve.light import FrameLight, LightPriors
 from shared.solve.light_models import LightModel, make_light_model
 from shared.solve.sample_errors import SampleErrors
 from shared.solve.scale import Highlights, most_likely_irradiance
+from shared.solve.skin_prior import SkinPrior, SkinVariation
 from shared.transfer import nearest_points, node_radiosity
 
 MINIMUM_ALBEDO, MAXIMUM_ALBEDO = 0.003, 1.0
@@ -49,6 +50,7 @@ class Settings:
     noise: tuple[float, float] = (0.006, 0.03)
     priors: LightPriors = field(default_factory=LightPriors)
     white_sigma: float = 0.15
+    skin: SkinVariation | None = field(default_factory=SkinVariation)
     visibility: bool = True
     bounce: bool = True
     specular: bool = True
@@ -96,6 +98,9 @@ class AppearanceSolver(SampleErrors):
         super().__init__(capture.samples, capture.fitted, frames, noise, settings.independent)
         self.table = LobeTable(capture.points.normals, capture.transfer.visibility(), capture.directions)
         self.node_to_point = nearest_points(capture.nodes.points, capture.points)
+        self.skin_prior = None
+        if settings.skin is not None and capture.skin.any():
+            self.skin_prior = SkinPrior(capture.points.positions, capture.skin, settings.skin)
         self.direct = torch.from_numpy(capture.transfer.direct.astype(np.float32))
         self.trust_highlights, self.prior_shares = False, None
         self.lobes: torch.Tensor | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -67,7 +68,9 @@ def fit_appearance(
     the light model asked for, can win, or the one that a step was undone to.
     """
     solver = AppearanceSolver(capture, settings)
-    judges = not capture.fitted.all()  # a clip too short to hold frames out is judged by the fitted ones
+    # A clip too short to hold frames out is judged by the fitted ones.
+    name, share = ("fitted", 1.0) if capture.fitted.all() else ("held_out", 1.0 - capture.fitted.mean())
+    judge = partial(_judged, name=name, count=share * settings.independent)
     records, best, schedule = [], None, settings.light_schedule
     trusts, first = settings.specular, 0
     if start is not None:
@@ -90,12 +93,12 @@ def fit_appearance(
                 records.append(record | {"undone": True})
                 report(records[-1])
                 if best is None and model == settings.light_model:
-                    best = (kept[0]["held_out" if judges else "fitted"], kept[0], _copy(solver.state), kept[2])
+                    best = (judge(kept[0]), kept[0], _copy(solver.state), kept[2])
                 break
             kept = record, _copy(solver.state), by_frame
             records.append(record)
             report(record)
-            judged = record["held_out" if judges else "fitted"]
+            judged = judge(record)
             if not shaping and model == settings.light_model and (best is None or judged < best[0]):
                 best = (judged, record, _copy(solver.state), by_frame)
             settled = judged > last * (1.0 - _SETTLED)
@@ -110,6 +113,15 @@ def fit_appearance(
     errors = record["fitted"], record["held_out"]
     light_trust = tuple(record.get("light_trust", ()))
     return Solution(state, tuple(records), *errors, trusted=trusts, frame_errors=by_frame, light_trust=light_trust)
+
+
+def _judged(record: dict, name: str, count: float) -> float:
+    """The residual of a step, raised by what the prior on skin says against its albedo.
+
+    A residual r of count independent samples and a prior's cost p together are as likely as a residual of
+    r sqrt(1 + 2 p / count) alone: no frame shows what samples leave open.
+    """
+    return record[name] * (1.0 + 2.0 * record["skin_prior"] / count) ** 0.5
 
 
 def with_local_roughness(solver: AppearanceSolver, solution: Solution) -> Solution:
@@ -148,6 +160,7 @@ def _step(
         "fitted": fitted,
         "held_out": held_out,
         "cost": step.before,
+        "skin_prior": step.unlikely_skin(),
         "specular_intensity": state.specular,
         "roughness": state.roughness,
     }, rise, solver.frame_errors(model)

@@ -17,6 +17,7 @@ from shared.solve.light import LightPriors
 from shared.solve.reference_settings import ReferenceSettings, Weights
 from shared.solve.reference_shade import Sampling
 from shared.solve.shape import ShapeSettings
+from shared.solve.skin_prior import SkinVariation
 
 SPECULAR_SPREAD = 0.25
 """Standard deviation of the logarithm of people's mean specular intensity about the expected one."""
@@ -34,6 +35,7 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         independent=params.evidence,
         priors=LightPriors(smooth=params.light_smoothness),
         white_sigma=params.white_light,
+        skin=SkinVariation(params.skin_brightness, params.skin_colour),
         visibility=params.visibility,
         bounce=params.bounce,
         specular=params.specular,

@@ -17,8 +17,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from shared.solve.appearance import AppearanceSolver
+from shared.solve.appearance import ALBEDO_PULL, AppearanceSolver
 from shared.solve.scale import settle_scale
+from shared.solve.skin_prior import SkinPull
 
 _LARGEST_RISE, _LARGEST_FALL = 1.5, 4.0
 """Bounds on a step of the log light, each texel by itself: the linearisation of exp holds for a rise of this size; a
@@ -66,12 +67,22 @@ class LightStep:
         self.evidence = solver.evidence(self.weight)
         self.before = 0.0
         self._fit_points()
+        self.skin = self._skin_pull()
 
     def _fit_points(self) -> None:
         solver = self.solver
         self.albedo = solver.eliminate(self.irradiance, self.reflection, self.weight)
         solver.state.albedo = self.albedo[..., 0].T.double().numpy()
         self.pure = solver.off_albedo(self.reflection, self.irradiance, self.weight)
+
+    def _skin_pull(self) -> SkinPull | None:
+        """The prior on skin near the present albedo; points count as far as the samples determine them."""
+        if self.solver.skin_prior is None:
+            return None
+        curvature = (self.weight * self.irradiance.square()).sum(2)
+        self.per_albedo = self.weight * self.irradiance / (curvature + ALBEDO_PULL)[..., None] / self.albedo
+        known = (curvature / (curvature + ALBEDO_PULL)).min(0).values
+        return self.solver.skin_prior.at(_log_of(self.albedo), known.double().numpy())
 
     def settle(self) -> None:
         """Specular intensity, the light's scale and the albedo for the present light, weights as they were."""
@@ -108,26 +119,37 @@ class LightStep:
         albedo = solver.eliminate(irradiance, reflection, self.weight, specular)
         model = albedo * irradiance + specular * reflection
         data = 0.5 * self.evidence * float((self.weight * (model - solver.colours).square()).sum())
-        return data + unlikely + self.model.prior(params, solver.settings.priors)[0]
+        skin = 0.0 if self.skin is None else self.skin.cost(_log_of(albedo))
+        return data + unlikely + skin + self.model.prior(params, solver.settings.priors)[0]
+
+    def unlikely_skin(self) -> float:
+        """What the prior on skin costs for the present albedo."""
+        return 0.0 if self.skin is None else self.skin.cost(_log_of(self.albedo))
 
     def _specular_prior(self) -> tuple[float, float]:
         """Mean and precision of the specular intensity."""
         mean, sigma = self.solver.settings.specular_prior
         return mean, (mean * sigma) ** -2
 
-    def _render(self, change: np.ndarray) -> torch.Tensor:
-        """Change of the model [3, P, F] with the parameters [M, 3], out of the eliminated unknowns' reach."""
+    def _render(self, change: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        """Change of the model [3, P, F] with the parameters [M, 3], and of it what is out of the eliminated unknowns'
+        reach."""
         solver = self.solver
         along = torch.from_numpy(solver.frame_light.along(self.model.tangent(solver.state.params, change)))
         result = self.albedo * torch.bmm(solver.baked, along.permute(2, 0, 1).contiguous())
         if solver.settings.specular:
             result += solver.state.specular * solver.reflect(along)
-        result = solver.off_albedo(result, self.irradiance, self.weight)
+        whole, result = result, solver.off_albedo(result, self.irradiance, self.weight)
         if solver.trust_highlights:
             weighted = self.weight * self.pure
             known = (weighted * self.pure).sum() + self._specular_prior()[1] / self.evidence
             result -= self.pure * ((weighted * result).sum() / known)
-        return result
+        return whole, result
+
+    def _pull_of_skin(self, log_albedo: np.ndarray) -> torch.Tensor:
+        """Derivative [3, P, F] of the prior on skin at log_albedo [3, P] by the model, whose rise the albedo that is
+        fitted to it turns into a fall of its own."""
+        return self.per_albedo * torch.from_numpy(-self.skin(log_albedo)).float()[..., None]
 
     def _adjoint(self, values: torch.Tensor) -> np.ndarray:
         """Transpose of the unprojected rendering: [3, P, F] -> [M, 3]."""
@@ -141,16 +163,27 @@ class LightStep:
         """[M, 3] derivative of cost by the parameters."""
         solver, state = self.solver, self.solver.state
         error = self.albedo * self.irradiance + state.specular * self.reflection - solver.colours
-        data = self.evidence * self._adjoint(self.weight * error)
+        values = self.evidence * self.weight * error
+        if self.skin is not None:
+            values = values + self._pull_of_skin(_log_of(self.albedo))
+        data = self._adjoint(values)
         _, prior, self.prior_product = self.model.prior(state.params, solver.settings.priors)
         return data + prior
 
     def product(self, change: np.ndarray) -> np.ndarray:
         """Gauss-Newton Hessian times a change [M, 3]."""
-        return self.evidence * self._adjoint(self.weight * self._render(change)) + self.prior_product(change)
+        whole, pure = self._render(change)
+        values = self.evidence * self.weight * pure
+        if self.skin is not None:
+            fall = -(self.per_albedo * whole).sum(2)
+            values = values + self._pull_of_skin(fall.double().numpy())
+        return self._adjoint(values) + self.prior_product(change)
 
     def take(self) -> None:
         """Moves the solver's light at constant mean irradiance per channel; halved until the cost falls.
+
+        Within the bounds by cutting off what single texels want too much, or by a shorter step as a whole, whichever
+        costs less: the one lets a lamp form, the other keeps the direction where many small wishes make up one pattern.
 
         The scale is left to settle: steps x are taken as Q x with Q = 1 - u g', where u raises the log light by one
         and g is the derivative of the log mean irradiance (g' u = 1), so that g' Q x = 0.
@@ -171,12 +204,17 @@ class LightStep:
         solved = conjugate_gradients(
             lambda x: level_transposed(self.product(level(x))), right, count, tolerance
         )
-        step = level(np.clip(level(solved), -_LARGEST_FALL, _LARGEST_RISE))
+        whole = level(solved)
+        longest = max(whole.max() / _LARGEST_RISE, -whole.min() / _LARGEST_FALL, 1.0)
+        steps = [level(np.clip(whole, -_LARGEST_FALL, _LARGEST_RISE)), whole / longest]
         self.before = self.cost(state.params)
-        for _ in range(6):
-            if self.cost(state.params + step) < self.before:
+        for halving in 0.5 ** np.arange(6):
+            costs = [self.cost(state.params + halving * step) for step in steps]
+            if min(costs) < self.before:
+                state.params = state.params + halving * steps[int(np.argmin(costs))]
                 break
-            step *= 0.5
-        else:
-            step *= 0.0
-        state.params = state.params + step
+
+
+def _log_of(albedo: torch.Tensor) -> np.ndarray:
+    """[3, P, 1] -> its logarithm [3, P]."""
+    return torch.log(albedo[..., 0]).double().numpy()

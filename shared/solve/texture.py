@@ -34,6 +34,10 @@ In a cavity that gets a tenth of the light it leaves the albedo open by a third.
 NORMAL_ERROR = 0.05
 """Error of a normal in radians: what a refined mesh still lacks. Where light grazes the skin it passes for albedo."""
 
+BORDER_ERROR = 0.0125
+"""Error of where the head's outline lies (half a millimetre) over half its radius: at a view cosine c the outline is
+c^2 times that half away, and so BORDER_ERROR / c^2 is the share of a sample that shows what lies behind."""
+
 POOL = 1.0
 """Texels of a neighbourhood that count as independent for the specular intensity: errors of shape and light are as
 wide as the neighbourhood itself."""
@@ -146,6 +150,23 @@ def weigh_lights(
         whole.clipped_ee += own.clipped_ee * share
         left += np.square(own.ee * share) * error
     return Evidence(whole, information, left / np.maximum(np.square(whole.ee), 1e-12))
+
+
+class BorderSums:
+    """How near its border the head shows each of T texels, over the frames: sums [2, T] of samples and weights."""
+
+    def __init__(self, texels: int):
+        self.sums = np.zeros((2, texels), np.float32)
+
+    def add(self, samples: TexelSamples) -> None:
+        """One frame; weights are squared cosines of the view, less near the mask's border."""
+        self.sums[0, samples.rows] += 1.0
+        self.sums[1, samples.rows] += samples.weight
+
+    def variance(self) -> np.ndarray:
+        """[T] of the log albedo: BORDER_ERROR / c^2 squared, the mean over the frames weighted as the albedo is."""
+        count, weight = self.sums
+        return np.square(BORDER_ERROR * count / np.maximum(weight, 1e-3))
 
 
 @compiled

@@ -15,6 +15,7 @@ from shared.solve.texture import (
     IRRADIANCE_ERROR,
     NORMAL_ERROR,
     PRIOR_SPREAD,
+    BorderSums,
     Evidence,
     Noise,
     NormalEquations,
@@ -99,6 +100,7 @@ class TexturePass:
 
     def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> Evidence:
         parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]
+        borders = [BorderSums(len(self.surface)) for _ in self.systematic]
         ahead = read_ahead(map(self.frame, self.progress(frames, label)))
         for f, (samples, irradiance, reflection) in zip(frames, ahead, strict=True):
             if material is None:
@@ -107,9 +109,11 @@ class TexturePass:
                 model = _model(material, samples, irradiance, reflection)
                 robust = robust_weight(model, samples, self.noise, material.information[samples.rows])
             parts[self.light_index[f]].add(samples, irradiance, reflection, robust)
+            borders[self.light_index[f]].add(samples)
         for part, trust in zip(parts, self.light_trust, strict=True):
             part.scale(trust)
-        return weigh_lights(parts, self.systematic, self.typical_albedo)
+        systematic = [error + own.variance()[:, None] for error, own in zip(self.systematic, borders, strict=True)]
+        return weigh_lights(parts, systematic, self.typical_albedo)
 
     def frame(self, f: int) -> tuple[TexelSamples, np.ndarray, np.ndarray]:
         """Samples of one frame with E and S [n, 3] at them."""
