@@ -75,7 +75,7 @@ class SurfaceViewer:
 
     def __init__(self, mesh: Mesh, scene: RayScene, margin_mm: float = 2.0, offset: float = 0.05):
         self.mesh, self.scene, self.offset = mesh, scene, offset
-        self.least_cosine = MINIMUM_VIEW_COSINE
+        self.error_mm, self.least_cosine = 0.0, MINIMUM_VIEW_COSINE
         self.normals = vertex_normals(mesh.vertices, mesh.faces)
         faces = mesh.faces
         edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -94,6 +94,7 @@ class SurfaceViewer:
         """The same for a surface that may be off by error_mm: it leaves out what is so close to the rim that the
         picture may show there what lies behind. At cosine c a ball of radius R lies R c^2 / 2 within its rim."""
         viewer = copy(self)
+        viewer.error_mm = error_mm
         rim = np.sqrt(4.0 * error_mm / BALL_MM)
         viewer.least_cosine = float(np.clip(rim, MINIMUM_VIEW_COSINE, MAXIMUM_LEAST_COSINE))
         return viewer

@@ -9,7 +9,15 @@ from shared.geometry import rigid, rotation_from_vector
 from shared.mesh import interpolate
 from shared.raycast import RayScene, camera_hits
 from shared.solve.maps import make_maps
-from shared.solve.texture import PRIOR_SPREAD, BorderSums, Noise, NormalEquations, pooled_specular, robust_weight
+from shared.solve.texture import (
+    LEAST_BORDER_MM,
+    PRIOR_SPREAD,
+    BorderSums,
+    Noise,
+    NormalEquations,
+    pooled_specular,
+    robust_weight,
+)
 from shared.solve.texture_pass import Clip, TexturePass
 from shared.texels import TexelSamples, TexelSurface, smooth_field
 from shared.texture import sample_bilinear
@@ -113,11 +121,13 @@ def test_what_is_left_of_a_mostly_clipped_texel_says_little():
 
 def test_what_is_only_seen_near_the_heads_border_says_little():
     """However many frames show it; one good view among many poor ones is enough."""
-    sums, cosines = BorderSums(3), np.array([[0.22, 0.9, 0.22]] * 40 + [[0.22, 0.9, 0.95]] * 20)
-    for row in cosines:
-        sums.add(TexelSamples(np.arange(3), np.full((3, 3), 0.3), row**2, np.zeros((3, 3), np.int8)))
-    share = PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + sums.variance())
+    sure, unsure = BorderSums(3, 0.0), BorderSums(3, 2.0)
+    for row in np.array([[0.22, 0.9, 0.22]] * 40 + [[0.22, 0.9, 0.95]] * 20):
+        for sums in (sure, unsure):
+            sums.add(TexelSamples(np.arange(3), np.full((3, 3), 0.3), row**2, np.zeros((3, 3), np.int8)))
+    share = PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + sure.variance())
     assert share[0] < 0.6 and share[1] > 0.99 and share[2] > 0.97
+    assert np.allclose(unsure.variance(), (2.0 / LEAST_BORDER_MM) ** 2 * sure.variance())
 
 
 def test_robust_weights():

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from shared.compiled import compiled
-from shared.gather import satisfied
+from shared.gather import BALL_MM, satisfied
 from shared.texels import TexelSamples, TexelSurface
 
 CORRELATED_FRAMES = 6.0
@@ -34,9 +34,8 @@ In a cavity that gets a tenth of the light it leaves the albedo open by a third.
 NORMAL_ERROR = 0.05
 """Error of a normal in radians: what a refined mesh still lacks. Where light grazes the skin it passes for albedo."""
 
-BORDER_ERROR = 0.0125
-"""Error of where the head's outline lies (half a millimetre) over half its radius: at a view cosine c the outline is
-c^2 times that half away, and so BORDER_ERROR / c^2 is the share of a sample that shows what lies behind."""
+LEAST_BORDER_MM = 0.5
+"""Error of where the head's outline lies, however well its surface is known."""
 
 POOL = 1.0
 """Texels of a neighbourhood that count as independent for the specular intensity: errors of shape and light are as
@@ -153,10 +152,11 @@ def weigh_lights(
 
 
 class BorderSums:
-    """How near its border the head shows each of T texels, over the frames: sums [2, T] of samples and weights."""
+    """How near its border the head shows each of T texels, over the frames: sums [2, T] of samples and weights.
+    error_mm: how far the surface may be off."""
 
-    def __init__(self, texels: int):
-        self.sums = np.zeros((2, texels), np.float32)
+    def __init__(self, texels: int, error_mm: float):
+        self.sums, self.error = np.zeros((2, texels), np.float32), max(error_mm, LEAST_BORDER_MM) / (0.5 * BALL_MM)
 
     def add(self, samples: TexelSamples) -> None:
         """One frame; weights are squared cosines of the view, less near the mask's border."""
@@ -164,9 +164,10 @@ class BorderSums:
         self.sums[1, samples.rows] += samples.weight
 
     def variance(self) -> np.ndarray:
-        """[T] of the log albedo: BORDER_ERROR / c^2 squared, the mean over the frames weighted as the albedo is."""
+        """[T] of the log albedo. At a view cosine c the border is BALL_MM c^2 / 2 away: the outline's error over that
+        is the share of a sample that shows what lies behind, its mean over the frames weighted as the albedo is."""
         count, weight = self.sums
-        return np.square(BORDER_ERROR * count / np.maximum(weight, 1e-3))
+        return np.square(self.error * count / np.maximum(weight, 1e-3))
 
 
 @compiled

@@ -100,7 +100,7 @@ class TexturePass:
 
     def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> Evidence:
         parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]
-        borders = [BorderSums(len(self.surface)) for _ in self.systematic]
+        borders = [BorderSums(len(self.surface), self.viewer.error_mm) for _ in self.systematic]
         ahead = read_ahead(map(self.frame, self.progress(frames, label)))
         for f, (samples, irradiance, reflection) in zip(frames, ahead, strict=True):
             if material is None:
