@@ -22,7 +22,7 @@ from shared.raycast import RayScene
 CLIPPED_CODE = 0.98
 CRUSHED_CODE = 0.012
 MINIMUM_VIEW_COSINE, MAXIMUM_LEAST_COSINE = 0.2, 0.5
-BALL_MM = 60.0
+BALL_MM = 80.0
 """A head is as round as a ball of this radius where it curves away from the camera."""
 _REMAP_COLUMNS = 1024
 

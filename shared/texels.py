@@ -98,17 +98,26 @@ class TexelSurface:
 
 
 def smooth_field(
-    mesh: Mesh, values: np.ndarray, precision: np.ndarray, mean: np.ndarray, step: float, spread: float
+    mesh: Mesh,
+    values: np.ndarray,
+    precision: np.ndarray,
+    mean: np.ndarray,
+    step: float,
+    spread: float,
+    region: np.ndarray | None = None,
 ) -> np.ndarray:
     """Most likely vertex values [V, C, ...] of fields that are smooth over the mesh, given values [V, C, ...] of some
     precision [V, C].
 
     Gaussian Markov field: neighbours differ by step, and a vertex from the mean [C] by spread, both standard
     deviations. Where nothing is known it continues its surroundings and sinks to the mean. Works across texture seams,
-    which a fill in the image cannot. Reference: Rue and Held, Gaussian Markov Random Fields, 2005, section 3.
+    which a fill in the image cannot. region [V]: neighbours in different ones have nothing in common. Reference: Rue
+    and Held, Gaussian Markov Random Fields, 2005, section 3.
     """
     count = len(mesh.vertices)
-    adjacency = vertex_adjacency(mesh.faces, count)
+    adjacency = vertex_adjacency(mesh.faces, count).tocoo()
+    if region is not None:
+        adjacency.data = adjacency.data * (region[adjacency.row] == region[adjacency.col])
     graph = sparse.diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency
     prior = graph / step**2 + sparse.identity(count) / spread**2
     result = np.empty(values.shape)

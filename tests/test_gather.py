@@ -20,7 +20,7 @@ def seen_radius(viewer):
 
 @pytest.fixture(scope="module")
 def viewer():
-    return SurfaceViewer.of(sphere(BALL_MM))
+    return SurfaceViewer.of(sphere(BALL_MM, levels=6))
 
 
 def test_a_sure_surface_is_seen_up_to_the_least_cosine(viewer):

@@ -168,6 +168,14 @@ def test_field_continues_what_is_known_and_sinks_to_the_mean():
     assert np.allclose(both[len(x) :], mean, atol=1e-6)
 
 
+def test_field_stops_where_another_region_begins():
+    plate = grid_plane(9, 1.0)
+    region = plate.uvs[:, 0] > 0.45
+    known = np.where(region, 0.0, 1e6)[:, None]
+    found = smooth_field(plate, np.full((len(region), 1), 2.0), known, np.zeros(1), 0.05, 1.0, region)[:, 0]
+    assert np.allclose(found[~region], 2.0, atol=1e-3) and np.allclose(found[region], 0.0, atol=1e-9)
+
+
 def test_field_weighs_values_by_their_precision():
     """One vertex against the mean: the posterior mean of two normal distributions."""
     plate = grid_plane(2, 1.0)

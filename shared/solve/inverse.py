@@ -25,7 +25,7 @@ from shared.solve.light_models import SeveralLights
 from shared.solve.maps import make_maps
 from shared.solve.normal_map import NormalPass, resolved_texels
 from shared.solve.reference_clip import solve_by_reference
-from shared.solve.reshape import meet_outline, surface_error
+from shared.solve.reshape import faces_of, meet_outline, surface_error
 from shared.solve.texture_pass import Clip, TexturePass
 from shared.texels import TexelSurface
 
@@ -59,7 +59,8 @@ def solve_clip(
     clip = Clip(inputs.picture, inputs.camera_from_head, inputs.intrinsics, fitted, inputs.light_index)
     typical = np.median(solution.state.albedo, axis=0)
     known = specular_at(surface, solution), typical
-    texture = TexturePass(surface, viewer, shading, clip, *known, light_trust=solution.light_trust, progress=progress)
+    more = {"light_trust": solution.light_trust, "region": scalp_of(inputs), "progress": progress}
+    texture = TexturePass(surface, viewer, shading, clip, *known, **more)
     widths = settings.map_size * np.array(settings.specular_widths if settings.appearance.specular else (np.inf,))
     material, texture_record = texture.run(widths)
     gloss = solution.gloss
@@ -81,6 +82,15 @@ def examine(lit: LitClip) -> tuple[dict[str, float], Solution]:
     """What the samples show beside the light: signs of what the model cannot follow, and roughness that varies."""
     solver = AppearanceSolver.at(lit.capture, lit.settings.appearance, lit.solution.state)
     return signs_of(solver), with_local_roughness(solver, lit.solution)
+
+
+def scalp_of(inputs: InverseInputs) -> np.ndarray | None:
+    """[V] bool: vertices of the scalp, whose hair says nothing of the skin; None where the mesh has no segments."""
+    if inputs.face_segment is None:
+        return None
+    scalp = np.zeros(len(inputs.mesh.vertices), bool)
+    scalp[inputs.mesh.faces[faces_of(inputs, ("scalp",))]] = True
+    return scalp
 
 
 def specular_at(surface: TexelSurface, solution: Solution) -> float | np.ndarray:

@@ -49,7 +49,8 @@ class TexturePass:
     """Per-texel albedo and specular intensity under a fixed light, roughness and geometry.
 
     specular: the clip's one intensity, the prior's mean; typical_albedo [3]; sigma: how far a texel may leave it;
-    light_trust: how much samples of each light count, by how well the model follows it; empty: all alike.
+    light_trust: how much samples of each light count, by how well the model follows it; empty: all alike;
+    region [V]: parts of the head, skin and hair, of which one says nothing of the other.
     """
 
     def __init__(
@@ -63,6 +64,7 @@ class TexturePass:
         sigma: float = 0.25,
         noise: Noise | None = None,
         light_trust: Sequence[float] = (),
+        region: np.ndarray | None = None,
         progress: Callable = lambda items, label: items,
     ):
         self.surface, self.viewer, self.shading, self.clip = surface, viewer, shading, clip
@@ -73,6 +75,7 @@ class TexturePass:
         self.light_trust = tuple(light_trust) or (1.0,) * len(lights)
         self.systematic = [self._systematic(own) / trust for own, trust in zip(lights, self.light_trust, strict=True)]
         self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), progress
+        self.region = region
 
     def _systematic(self, frames: np.ndarray) -> np.ndarray:
         """[T, 3]: variance of the log albedo that all frames of one light share."""
@@ -166,7 +169,7 @@ class TexturePass:
         # What leaves a texel as open as the prior does is mostly a model's error that its neighbours share.
         known = np.where(total > 0.0, share**2 / (share + PRIOR_SPREAD**-2), 0.0)
         centre = np.zeros(precision.shape[1])
-        return smooth_field(self.surface.mesh, means, known, centre, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD)
+        return smooth_field(self.surface.mesh, means, known, centre, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD, self.region)
 
     def held_out_errors(self, candidates: list[TexelMaterial]) -> list[float]:
         """Root mean square residual of each candidate on the held-out frames (linear, censored, trust-weighted)."""
