@@ -99,8 +99,9 @@ class VertexShading:
         direct = irradiance(self.transfer, self.light_along.reshape(len(self.directions), -1))
         bounces = self._radiosity is not None
         bounced = bounced_irradiance(self.transfer, self._sent_by_nodes()) if bounces else np.zeros_like(direct)
-        self._irradiance = (direct + bounced).reshape(shape).astype(np.float16)
-        self._bounced = bounced.reshape(shape).astype(np.float16)
+        total = direct + bounced
+        self._irradiance = total.reshape(shape).astype(np.float16)
+        self._bounced = (total - direct).reshape(shape).astype(np.float16)
         self._centres = camera_centres(camera_from_head)
         self._turn = turned_so_far(camera_from_head)
         if light_index is not None:  # so that no frame lies between key frames of two lights
