@@ -30,7 +30,7 @@ from shared.solve.light_models import LightModel, make_light_model
 from shared.solve.sample_errors import SampleErrors
 from shared.solve.scale import Highlights, most_likely_irradiance
 from shared.solve.skin_prior import SkinPrior, SkinVariation
-from shared.transfer import nearest_points, node_radiosity
+from shared.transfer import nearest_points
 
 MINIMUM_ALBEDO, MAXIMUM_ALBEDO = 0.003, 1.0
 ALBEDO_PULL = 25.0
@@ -188,10 +188,12 @@ class AppearanceSolver(SampleErrors):
         if self.settings.bounce:
             returned = self.state.specular * hemispherical_albedo(round(self.state.roughness, 3))
             effective = self.state.node_albedo + returned
-            radiosity = torch.from_numpy(node_radiosity(self.capture.node_transfer, effective)).float()
-            node_direct = torch.from_numpy(self.capture.node_transfer.direct.astype(np.float32))
-            bounce = torch.from_numpy(self.capture.transfer.bounce.astype(np.float32))
-            self.baked = torch.stack([self.direct + bounce @ (radiosity[..., c] @ node_direct) for c in range(3)])
+            # node_radiosity @ direct, without the matrix in between
+            form, node_direct = (torch.from_numpy(table.astype(np.float32))
+                                 for table in (self.capture.node_transfer.bounce, self.capture.node_transfer.direct))
+            albedo = torch.from_numpy(effective.T.astype(np.float32))[..., None]
+            radiosity = torch.linalg.solve(torch.eye(len(form)) - albedo * form, albedo * node_direct)
+            self.baked = self.direct + torch.from_numpy(self.capture.transfer.bounce.astype(np.float32)) @ radiosity
 
     def bake_lobes(self, roughness: float | np.ndarray | None = None) -> None:
         """The specular tables [F, P, J] for the present roughness, or for another one or each point's own [P]."""
