@@ -17,9 +17,8 @@ LOOKS = 12
 class ChartWatch:
     """Tell it with `expect` how many frames there will be, show them with `look`, then ask for `record` and `warnings`.
 
-    picture: of the first chart found, of the first that can be used if any
-    can (see chart_picture); None without one. A chart found once is looked for in the same place where the detector
-    misses it later: most charts stand still.
+    picture: of the first chart found, of the first that can be used if any can (see chart_picture); None without one. A
+    chart found once is looked for in the same place where the detector misses it later: most charts stand still.
     """
 
     def __init__(self, place: ChartPlace, transfer: str) -> None:

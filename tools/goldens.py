@@ -3,9 +3,8 @@
     python -m tools.goldens [STAGE ...]     runs the tiny subject and rewrites tests/golden/<stage>.json
 
 A golden file changes only on purpose, together with its stage's version or an earlier stage's, with the reason in the
-commit. Images are kept
-as a coarse grid of block means, arrays as evenly spaced samples with their spread: enough to notice any change of
-result, small enough to read in a review.
+commit. Images are kept as a coarse grid of block means, arrays as evenly spaced samples with their spread: enough to
+notice any change of result, small enough to read in a review.
 """
 
 from __future__ import annotations

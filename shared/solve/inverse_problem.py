@@ -31,8 +31,8 @@ from shared.solve.texture import TexelMaterial
 from shared.transfer import mesh_points
 
 FACE_SKIN = ("forehead", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "chin", "jaw")
-"""Segments whose skin the light is solved from; hair, brows, lips, lids, eyes and what
-clothes may cover are left out."""
+"""Segments whose skin the light is solved from; hair, brows, lips, lids, eyes and what clothes may cover are left out.
+"""
 
 
 class InverseInputs(Protocol):
