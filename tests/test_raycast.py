@@ -16,6 +16,7 @@ def test_distance_and_place_of_a_hit():
     assert face[1] == -1 and np.isinf(distance[1])
     assert np.isclose(distance[0], 2.0)
     assert np.allclose(interpolate(plane.vertices, plane.faces, face[:1], bary[:1]), [[0.3, -0.2, 0]], atol=1e-6)
+    assert (scene.first_faces(origins, np.array([[0, 0, -2.0], [0, 0, -2.0]])) == face).all()
 
 
 def test_occlusion_has_no_range():
@@ -30,6 +31,7 @@ def test_no_rays_no_hits():
     scene = RayScene(grid_plane().vertices, grid_plane().faces)
     assert scene.occluded(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
     assert scene.intersect(np.zeros((0, 3)), np.zeros((0, 3)))[1].shape == (0, 3)
+    assert scene.first_faces(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
 
 
 def test_camera_sees_the_disc_of_a_sphere():

@@ -43,6 +43,7 @@ def test_chosen_frames_are_the_same_as_in_a_full_pass(tmp_path):
     some = {frame.index: frame.codes() for frame in reader.frames([3, 11, 17])}
     assert sorted(some) == [3, 11, 17]
     assert all(np.array_equal(whole[i], codes) for i, codes in some.items())
+    assert [frame.index for frame in reader.frames(step=6)] == [0, 6, 12, 18]
 
 
 def test_ten_bit_video_keeps_its_depth(tmp_path):
@@ -86,6 +87,22 @@ def test_image_sequences_are_read_exactly(tmp_path, suffix, kind):
     assert sorted(frames) == [0, 1, 4] and reader.info.frame_count == 5
     assert all(np.array_equal(frames[i], image) for i, image in zip((0, 1, 4), images, strict=True))
     assert any("missing" in text for text in reader.info.warnings)
+    assert [frame.index for frame in reader.frames(step=2)] == [0, 4]
+
+
+def test_photographs_are_turned_as_their_camera_says(tmp_path):
+    upright = np.zeros((96, 64, 3), np.uint8)
+    upright[:30, -20:] = 250, 20, 20
+    directory = struct.pack("<HHHIHHI", 1, 0x112, 3, 1, 6, 0, 0)  # one entry: orientation 6, a quarter turn clockwise
+    note = b"Exif\0\0" + b"II*\0" + struct.pack("<I", 8) + directory
+    stored = cv2.imencode(".jpg", np.ascontiguousarray(np.rot90(upright)[..., ::-1]))[1].tobytes()
+    turned = stored[:2] + b"\xff\xe1" + struct.pack(">H", len(note) + 2) + note + stored[2:]
+    (tmp_path / "photo_1.jpg").write_bytes(turned)
+    (tmp_path / "photo_2.jpg").write_bytes(b"GIF89a" + stored)
+    (tmp_path / "photo_3.jpg").write_bytes(b"")
+    first, *others = open_video(tmp_path / "photo_%d.jpg").frames()
+    assert np.abs(first.codes().astype(int) - upright).mean() < 2
+    assert [frame.fault for frame in others] == ["not an image that can be read"] * 2
 
 
 def test_grey_and_alpha_images_become_rgb(tmp_path):
