@@ -6,11 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from toy_capture import FRAMES, make_truth
+from toy_head import toy_head
 
 from shared.errors import InputError
 from shared.io.images import write_exr
 from shared.solve.appearance import AppearanceSolver, Settings
-from shared.solve.doubts import by_orientation, doubts_about, signs_of, unlikely_colour
+from shared.solve.doubts import by_orientation, doubts_about, face_regions, signs_of, unlikely_colour
 from shared.solve.fit_appearance import fit_appearance
 from stages.inverse_render import check
 
@@ -22,10 +23,10 @@ def capture(one_thread):
     return make_truth(specular=0.0)[0]
 
 
-def signs(capture, colours=None):
+def signs(capture, colours=None, regions=None):
     if colours is not None:
         capture = replace(capture, samples=replace(capture.samples, colours=colours.astype(np.float32)))
-    return signs_of(AppearanceSolver.at(capture, MATTE, fit_appearance(capture, MATTE).state))
+    return signs_of(AppearanceSolver.at(capture, MATTE, fit_appearance(capture, MATTE).state), regions)
 
 
 @pytest.fixture(scope="module")
@@ -61,10 +62,49 @@ def test_only_what_follows_the_normals_counts():
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(2000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    pattern = np.exp(0.5 * rng.normal(size=2000))[:, None] * [0.3, 0.2, 0.15]
+    pattern = np.exp(0.15 * rng.normal(size=2000))[:, None] * [0.3, 0.2, 0.15]
     assert by_orientation(pattern, normals) < 0.05
     shaded = pattern * np.exp(0.4 * normals[:, 2:])
     assert by_orientation(shaded, normals) == pytest.approx(0.4 / np.sqrt(3), rel=0.15)
+
+
+def test_hair_that_looks_up_or_down_is_no_light():
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(2000, 3)) + [0.0, 0.0, 1.0]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    brightness = 0.1 * rng.normal(size=2000) - 2.0 * (normals[:, 1] > 0.55)
+    haired = np.exp(brightness)[:, None] * [0.3, 0.2, 0.15]
+    assert (normals[:, 1] > 0.55).mean() > 0.15 and by_orientation(haired, normals) < 0.05
+    lit = haired * np.exp(0.6 * normals[:, 2:])
+    assert by_orientation(lit, normals) > 0.25
+
+
+def test_what_stands_before_the_skin_is_told_with_its_place(capture, calm):
+    """Rims that hide a third of the points around the eyes in every other frame."""
+    regions = {"eyes": capture.points.positions[:, 1] > np.median(capture.points.positions[:, 1])}
+    hidden = regions["eyes"] & (np.arange(len(regions["eyes"])) % 3 == 0)
+    colours = np.array(capture.samples.colours)
+    colours[np.ix_(hidden, np.arange(FRAMES) % 2 == 0)] *= 0.1
+    found = [signs(capture, given, regions) for given in (None, colours)]
+    assert found[0]["covered_eyes"] < 0.1 and found[1]["covered_eyes"] == pytest.approx(1 / 3, abs=0.08)
+    assert "covered_eyes" not in calm
+    assert doubts_about(found[0]) == []
+    assert any("around the eyes" in text and "glasses" in text for text in doubts_about(found[1]))
+
+
+def test_regions_of_a_face_are_where_its_segments_are():
+    mesh = toy_head(3).mesh(np.zeros(2), np.zeros(1))
+    centre = mesh.vertices[mesh.faces].mean(1)
+    names = ("cheek_left", "eyes", "forehead")
+    high = np.percentile(centre[:, 1], 80)
+    segment = np.where(centre[:, 1] > high, 2, 0)
+    segment[np.argmax(centre[:, 2])] = 1
+    regions = face_regions(mesh, segment, names, mesh.vertices)
+    eye = mesh.vertices[mesh.faces[segment == 1].ravel()].mean(0)
+    near = np.linalg.norm(mesh.vertices - eye, axis=1) < 20.0
+    assert regions["forehead"].any() and not (regions["forehead"] & regions["eyes"]).any()
+    assert regions["eyes"][near & ~regions["forehead"]].all() and near.any() and not regions["eyes"].all()
+    assert face_regions(mesh, None, names, mesh.vertices) == {}
 
 
 def test_an_unlikely_colour_is_one_that_neither_skin_nor_light_has():

@@ -13,7 +13,6 @@ only that. A case that has a row of the same versions is not run again, so that 
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 import time
 from pathlib import Path
@@ -54,7 +53,6 @@ def do_case(name: str, case: Case, work: Path, version: str) -> None:
     began = time.monotonic()
     subject = make_subject(case, work / "subjects" / f"{name}_{case.digest}", work / "takes")
     made = time.monotonic() - began
-    shutil.rmtree(work / "runs" / subject.name, ignore_errors=True)
     row = run_case(subject, work / "runs", load_pipeline(None))
     write_json(row_file(work, case), {"name": name, "code": version, "making_s": made, **row})
     state = f"exit {row['exit']} {row['message']}" if row["exit"] else f"albedo {row['scores']['albedo']:.2f} dE"

@@ -10,7 +10,7 @@ import contextlib
 import importlib
 import io
 import shutil
-import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -37,21 +37,27 @@ SETTINGS = {
 
 
 def run_case(subject: Path, out: Path, pipeline: Pipeline) -> dict:
-    """{"exit", "message", "seconds", "scores", "warnings", "gates", "missed_gates"} of one subject."""
-    began, run = time.monotonic(), RunFolder.of(subject, subject.name, out)
+    """{"exit", "message", "seconds", "scores", "warnings", "gates", "missed_gates"} of one subject.
+
+    Stages whose results in out are current are not run again; seconds are those that they took when they were.
+    """
+    run, done = RunFolder.of(subject, subject.name, out), []
     for stage in SETTINGS:
         code, message = _run_stage(stage, subject, out)
         if code:
             named = message.replace(str(subject), "the subject")
-            return {"exit": code, "message": named, "seconds": time.monotonic() - began, "scores": {},
-                    "warnings": warnings_of(run), "gates": {}, "missed_gates": []}
-    seconds = time.monotonic() - began
+            records = provenances(run, done)
+            return {"exit": code, "message": named, "seconds": sum(record["wall_s"] for record in records),
+                    "scores": {}, "warnings": warnings_of(records), "gates": {}, "missed_gates": []}
+        done.append(stage)
+    records = provenances(run, done)
     export_maps(run)
     gates = {name: MEASURES[name](run) for name in pipeline.gates}
     missed = [str(Flag(name, value, pipeline.gates[name].limit)) for name, value in gates.items()
               if value is not None and not pipeline.gates[name].holds(value)]
+    seconds = sum(record["wall_s"] for record in records)
     return {"exit": 0, "message": "", "seconds": seconds, "scores": scores_of(subject, run),
-            "warnings": warnings_of(run), "gates": gates, "missed_gates": missed,
+            "warnings": warnings_of(records), "gates": gates, "missed_gates": missed,
             "signs": (read_record(run.published("inverse_render") / "solve.json") or {}).get("signs", {})}
 
 
@@ -79,10 +85,14 @@ def export_maps(run: RunFolder) -> None:
     write_obj(export / "mesh.obj", load_mesh(solved / "mesh.npz"))
 
 
-def warnings_of(run: RunFolder) -> list[str]:
-    """What the stages that have finished warn of, each text once."""
-    records = (read_record(run.published(stage) / "provenance.json") or {} for stage in SETTINGS)
-    return list(dict.fromkeys(text for record in records for text in record.get("warnings", [])))
+def provenances(run: RunFolder, stages: Iterable[str]) -> list[dict]:
+    """provenance.json of finished stages."""
+    return [read_record(run.published(stage) / "provenance.json") for stage in stages]
+
+
+def warnings_of(records: Iterable[dict]) -> list[str]:
+    """What the stages of these provenances warn of, each text once."""
+    return list(dict.fromkeys(text for record in records for text in record["warnings"]))
 
 
 def scores_of(subject: Path, run: RunFolder) -> dict[str, float]:

@@ -28,6 +28,8 @@ _ADVICE = (
     (r"follows the surface's orientation",
      "Film with lights that stand still, none on the head or in the hand, and a wider turn; a lamp that moves along "
      "ends up in the albedo as if it were skin."),
+    (r"in front of it",
+     "Take off glasses, tie hair back, and film again; in these maps what stood before the skin is part of it."),
     (r"unlikely colour",
      "Check colour: transfer in subject.yaml, switch filters off, or show a colour chart; the albedo's tint is a "
      "guess."),

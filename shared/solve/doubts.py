@@ -6,35 +6,60 @@ mean:
   the model: exposure or white balance drifts;
 - albedo_by_orientation: deviation of the part of the skin's log albedo that follows the surface's normals. A lamp on
   the head shades each point alike in every frame, and so ends up in the albedo;
-- unlikely_colour: by how many deviations skin and light together leave the priors on the colours of both.
+- unlikely_colour: by how many deviations skin and light together leave the priors on the colours of both;
+- covered_eyes, covered_forehead: share of the points there that fit far worse than the face does: what stands off the
+  skin, as glasses and strands of hair do, moves and shades otherwise than the surface that it is taken for.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from shared.color import LUMINANCE
-from shared.mesh import normalised
+from shared.mesh import Mesh, normalised
 from shared.solve.appearance import AppearanceSolver
+from shared.solve.ladder_gloss import segments_at
 from shared.solve.scale import scale_prior
 
 WANDERING_GAIN, WANDERING_TINT = 0.03, 0.04
 """Clips with everything locked have 0.003 to 0.006 and 0.003 to 0.011, one under a single hard lamp 0.017 and 0.032."""
 ORIENTED_ALBEDO, UNLIKELY_COLOUR = 0.3, 3.0
-"""Good clips have 0.02 to 0.2 and 0.5 to 1.4; a third of the light moving along gives 0.3 to 0.5."""
+"""Good clips have 0.03 to 0.26 and 0.5 to 1.4; a third of the light moving along gives 0.3 to 0.5."""
+BIWEIGHT_REACH, ROBUST_ROUNDS, SKIN_SPREAD = 4.685 * 1.4826, 12, (0.02, 0.1)
+"""Of the logarithm of a person's skin: median deviations that are possible; more is hair, or light in the albedo."""
+COVERED, FAR_WORSE = 0.25, 3.0
+"""Share of a region's points, and how many times worse than the face's median they fit: 0 to 0.1 without anything
+before the skin, 0.4 with glasses, 0.5 with a fringe."""
+NEAR_EYES_MM, FEWEST_POINTS = 30.0, 20
 POINTS = 500
 LEAST_MODEL = 0.01
 """Linear radiance below which a ratio to it is noise."""
 
 
-def signs_of(solver: AppearanceSolver) -> dict[str, float]:
-    """{"frame_gain", "frame_tint", "albedo_by_orientation", "unlikely_colour"} of a solver at its solution, baked."""
+def face_regions(
+    mesh: Mesh, face_segment: np.ndarray | None, segment_names: tuple[str, ...], positions: np.ndarray
+) -> dict[str, np.ndarray]:
+    """{"eyes", "forehead"} -> [P] bool: which points [P, 3] on the skin lie around the eyes, and on the forehead."""
+    if face_segment is None or "eyes" not in segment_names:
+        return {}
+    eyes = mesh.vertices[mesh.faces[face_segment == segment_names.index("eyes")].ravel()]
+    forehead = segments_at(mesh, face_segment, positions) == segment_names.index("forehead")
+    return {"eyes": (cKDTree(eyes).query(positions)[0] < NEAR_EYES_MM) & ~forehead, "forehead": forehead}
+
+
+def signs_of(solver: AppearanceSolver, regions: Mapping[str, np.ndarray] | None = None) -> dict[str, float]:
+    """The signs by name of a solver at its solution, baked; regions [P] bool: see face_regions."""
     capture = solver.capture
-    part = solver.subset(slice(None, None, -(-len(capture.points) // POINTS)))
+    some = slice(None, None, -(-len(capture.points) // POINTS))
+    part = solver.subset(some)
     if solver.settings.specular:
         part.bake_lobes()
-    gains = frame_gains(part, part.model(*part.forward(part.state.light)))
+    model = part.model(*part.forward(part.state.light))
+    gains, misfit = frame_gains(part, model), misfits(part, model)
     weight = part.trust * torch.from_numpy(part.capture.skin.astype(np.float32))[None, :, None]
     radiance = ((weight * part.colours).sum((1, 2)) / weight.sum()).double().numpy()
     skin = capture.skin
@@ -43,12 +68,13 @@ def signs_of(solver: AppearanceSolver) -> dict[str, float]:
         "frame_tint": (gains[:, 0] - gains[:, 2]).std(),
         "albedo_by_orientation": by_orientation(solver.state.albedo[skin], capture.points.normals[skin]),
         "unlikely_colour": unlikely_colour(radiance, solver.settings.white_sigma),
+        **{f"covered_{name}": covered_share(misfit, region[some]) for name, region in (regions or {}).items()},
     }
     return {name: round(float(value), 4) for name, value in signs.items()}
 
 
-def doubts_about(signs: dict[str, float]) -> list[str]:
-    """What a person should know, from signs_of."""
+def doubts_about(signs: dict[str, float], moves: str = "head") -> list[str]:
+    """What a person should know, from signs_of; moves: the head or the camera."""
     found = []
     if signs["frame_gain"] > WANDERING_GAIN:
         found.append(f"the face's brightness wanders by {signs['frame_gain']:.0%} from frame to frame, more than its "
@@ -58,11 +84,30 @@ def doubts_about(signs: dict[str, float]) -> list[str]:
                      "balance and keep the light still")
     if signs["albedo_by_orientation"] > ORIENTED_ALBEDO:
         found.append(f"the skin's albedo follows the surface's orientation by {signs['albedo_by_orientation']:.0%}: "
-                     "part of the light moves with the head, or the clip does not tell light from skin")
+                     + "part of the light moves with the head, or " * (moves == "head")
+                     + "the clip does not tell light from skin")
     if signs["unlikely_colour"] > UNLIKELY_COLOUR:
         found.append(f"skin and light together have an unlikely colour ({signs['unlikely_colour']:.1f} deviations): "
                      "coloured light, a filter, or a colour.transfer that is not the camera's")
+    for name, words in (("covered_eyes", "around the eyes"), ("covered_forehead", "of the forehead")):
+        if signs.get(name, 0.0) > COVERED:
+            found.append(f"{signs[name]:.0%} of the skin {words} fits far worse than the face does: glasses, hair or "
+                         "something else in front of it, which the maps show as skin")
     return found
+
+
+def misfits(solver: AppearanceSolver, model: torch.Tensor) -> np.ndarray:
+    """[P] mean absolute residual of the model [3, P, F] over the assumed noise."""
+    error, silent = solver.errors(model)
+    total = (solver.trust * (~silent) * error.sqrt()).sum((0, 2))
+    return (total / (3.0 * solver.trust.sum((0, 2))).clamp_min(1e-9)).double().numpy()
+
+
+def covered_share(misfit: np.ndarray, region: np.ndarray) -> float:
+    """Share of a region's points [P] bool whose misfit [P] is far above the median; 0 where the region has too few."""
+    if region.sum() < FEWEST_POINTS:
+        return 0.0
+    return float((misfit[region] > FAR_WORSE * np.median(misfit)).mean())
 
 
 def frame_gains(solver: AppearanceSolver, model: torch.Tensor) -> np.ndarray:
@@ -77,12 +122,21 @@ def by_orientation(albedo: np.ndarray, normals: np.ndarray) -> float:
     """Standard deviation of the part of log luminance of albedo [P, 3] that quadratics in the normals [P, 3] explain.
 
     Quadratics hold nearly all that a lamp does to a matte surface (Ramamoorthi and Hanrahan, An Efficient
-    Representation for Irradiance Environment Maps, SIGGRAPH 2001).
+    Representation for Irradiance Environment Maps, SIGGRAPH 2001). Points far from the others count for nothing: hair
+    over the forehead and a beard look up and down, too. Biweights, from the median on (Beaton and Tukey, 1974).
     """
     x, y, z = normalised(normals).T
     design = np.stack([np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], axis=1)
     brightness = np.log(np.maximum(albedo @ LUMINANCE, 1e-3))
-    return float((design @ np.linalg.lstsq(design, brightness, rcond=None)[0]).std())
+    shaded = np.full(len(brightness), np.median(brightness))
+    for _ in range(ROBUST_ROUNDS):
+        off = brightness - shaded
+        reach = BIWEIGHT_REACH * float(np.clip(np.median(np.abs(off)), *SKIN_SPREAD))
+        weight = np.square(np.clip(1.0 - np.square(off / reach), 0.0, None))
+        root = np.sqrt(weight)
+        shaded = design @ np.linalg.lstsq(design * root[:, None], brightness * root, rcond=None)[0]
+    mean = np.average(shaded, weights=weight)
+    return float(np.sqrt(np.average(np.square(shaded - mean), weights=weight)))
 
 
 def unlikely_colour(radiance: np.ndarray, white_sigma: float) -> float:

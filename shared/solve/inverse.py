@@ -10,7 +10,7 @@ from shared.chart import ChartSight
 from shared.gather import SurfaceViewer
 from shared.solve.appearance import AppearanceSolver
 from shared.solve.chart_scale import describe_scale, doubt_scale, state_chart
-from shared.solve.doubts import doubts_about, signs_of
+from shared.solve.doubts import doubts_about, face_regions, signs_of
 from shared.solve.fit_appearance import Solution, with_local_roughness
 from shared.solve.inverse_problem import (
     InverseInputs,
@@ -71,7 +71,7 @@ def solve_clip(
         turn, relief = fine.run(resolved_texels(surface, clip))
         note(f"fine normals: {relief}")
     maps = make_maps(surface, material, roughness, turn)
-    warnings = [*[warning] * bool(warning), *doubt_scale(chart, typical), *doubts_about(signs)]
+    warnings = [*[warning] * bool(warning), *doubt_scale(chart, typical), *doubts_about(signs, inputs.moves)]
     shape_record = {**lit.shape_record, "outline": outline}
     record = {"texture": texture_record, "shape": shape_record, "relief": relief, "signs": signs, "warnings": warnings}
     record |= {"albedo_scale": describe_scale(chart, typical), "rungs": lit.rungs}
@@ -80,8 +80,10 @@ def solve_clip(
 
 def examine(lit: LitClip) -> tuple[dict[str, float], Solution]:
     """What the samples show beside the light: signs of what the model cannot follow, and roughness that varies."""
-    solver = AppearanceSolver.at(lit.capture, lit.settings.appearance, lit.solution.state)
-    return signs_of(solver), with_local_roughness(solver, lit.solution)
+    solver, inputs = AppearanceSolver.at(lit.capture, lit.settings.appearance, lit.solution.state), lit.inputs
+    positions = lit.capture.points.positions
+    regions = face_regions(inputs.mesh, inputs.face_segment, inputs.segment_names, positions)
+    return signs_of(solver, regions), with_local_roughness(solver, lit.solution)
 
 
 def scalp_of(inputs: InverseInputs) -> np.ndarray | None:
