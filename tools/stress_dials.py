@@ -1,7 +1,8 @@
 """The dials of the stress test: where methods fail, each with a severity that grows from none.
 
-A case says what stands before the camera, what the camera makes of it, and what the subject's files claim. The dial at
-0 is one and the same case for all of them. Dials stand in the order of how likely they are to fail in silence.
+A case says what stands before the camera, what the camera makes of it, and what the subject's files claim. Pictures are
+exposed so that the skin is not clipped, unless that is what the dial is about. The dial at 0 is one and the same case
+for all of them. Dials stand in the order of how likely they are to fail in silence.
 """
 
 from __future__ import annotations
@@ -59,8 +60,8 @@ def _shot(**sensor: float) -> Case:
     return Case(sensor=Sensor(**sensor))
 
 
-def _between(other: Take, share: float) -> Case:
-    return Case(mix=((Take(), 1.0 - share), (other, share)))
+def _between(other: Take, share: float, exposure: float = 1.0) -> Case:
+    return Case(mix=((Take(), 1.0 - share), (other, share)), sensor=Sensor(exposure=exposure))
 
 
 DIALS = (
@@ -85,7 +86,7 @@ DIALS = (
     Dial("overexposed", "one side overexposed", "stops above", (1.0, 2.0),
          lambda s: _shot(exposure=2.0**s), r"overexposed"),
     Dial("hard_sun", "a single hard sun", "share of the light", (0.5, 1.0),
-         lambda s: _between(Take(light="lamp"), s), r"hard (light|lamp|sun)|shadow"),
+         lambda s: _between(Take(light="lamp"), s, 2 ** (-0.85 * s)), r"hard (light|lamp|sun)|shadow"),
     Dial("coloured_light", "red light from the left, blue from the right", "saturation", (0.5, 1.0),
          lambda s: _seen(tint=s), r"coloured|tint"),
     Dial("glasses", "glasses", "mm, thickness of the rims", (0.8, 2.5),
@@ -107,7 +108,8 @@ DIALS = (
     Dial("landmark_bias", "landmarks of another tracker that slide", "share of the face's width", (0.02, 0.06),
          lambda s: Case(landmark_slide=s), r"landmarks|do not fit"),
     Dial("dark_skin", "very dark skin", "melanin beyond 0.35", (0.65, 1.45),
-         lambda s: _seen(tone=0.35 + s), r"scale|skin's (tone|luminance)"),
+         lambda s: Case(mix=((Take(tone=0.35 + s), 1.0),), sensor=Sensor(exposure=2 ** (-0.7 * s))),
+         r"scale|skin's (tone|luminance)"),
     Dial("light_skin", "very light skin", "melanin short of 0.35", (0.25,),
          lambda s: _seen(tone=0.35 - s), r"scale|skin's (tone|luminance)"),
     Dial("beard", "beard", "mm", (3.0, 9.0), lambda s: _seen(beard_mm=s), r"beard|hair"),
