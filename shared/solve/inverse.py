@@ -8,6 +8,7 @@ import numpy as np
 
 from shared.chart import ChartSight
 from shared.gather import SurfaceViewer
+from shared.mesh import uniform_laplacian
 from shared.solve.appearance import AppearanceSolver
 from shared.solve.chart_scale import describe_scale, doubt_scale, state_chart
 from shared.solve.doubts import doubts_about, face_regions, signs_of
@@ -26,8 +27,12 @@ from shared.solve.maps import make_maps
 from shared.solve.normal_map import NormalPass, resolved_texels
 from shared.solve.reference_clip import solve_by_reference
 from shared.solve.reshape import faces_of, meet_outline, surface_error
+from shared.solve.shape import typical_edge
 from shared.solve.texture_pass import Clip, TexturePass
 from shared.texels import TexelSurface
+
+HAIRLINE_MM = 10.0
+"""Bends of the hairline shorter than this are the mesh's, not the hair's."""
 
 
 def solve_clip(
@@ -87,12 +92,17 @@ def examine(lit: LitClip) -> tuple[dict[str, float], Solution]:
 
 
 def scalp_of(inputs: InverseInputs) -> np.ndarray | None:
-    """[V] bool: vertices of the scalp, whose hair says nothing of the skin; None where the mesh has no segments."""
+    """[V] bool: vertices of the scalp, whose hair says nothing of the skin, within a border as smooth as a hairline;
+    None where the mesh has no segments."""
     if inputs.face_segment is None:
         return None
-    scalp = np.zeros(len(inputs.mesh.vertices), bool)
-    scalp[inputs.mesh.faces[faces_of(inputs, ("scalp",))]] = True
-    return scalp
+    mesh = inputs.mesh
+    scalp = np.zeros(len(mesh.vertices))
+    scalp[mesh.faces[faces_of(inputs, ("scalp",))]] = 1.0
+    laplacian = uniform_laplacian(mesh.faces, len(scalp))
+    for _ in range(round((HAIRLINE_MM / typical_edge(mesh.vertices, mesh.faces)) ** 2)):
+        scalp -= 0.5 * (laplacian @ scalp)
+    return scalp > 0.5
 
 
 def specular_at(surface: TexelSurface, solution: Solution) -> float | np.ndarray:
