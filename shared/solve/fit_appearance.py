@@ -160,7 +160,7 @@ def _step(
         "fitted": fitted,
         "held_out": held_out,
         "cost": step.before,
-        "skin_prior": step.unlikely_skin(),
+        "skin_prior": step.unlikely_skin(step.albedo),
         "specular_intensity": state.specular,
         "roughness": state.roughness,
     }, rise, solver.frame_errors(model)

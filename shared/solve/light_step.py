@@ -119,12 +119,11 @@ class LightStep:
         albedo = solver.eliminate(irradiance, reflection, self.weight, specular)
         model = albedo * irradiance + specular * reflection
         data = 0.5 * self.evidence * float((self.weight * (model - solver.colours).square()).sum())
-        skin = 0.0 if self.skin is None else self.skin.cost(_log_of(albedo))
-        return data + unlikely + skin + self.model.prior(params, solver.settings.priors)[0]
+        return data + unlikely + self.unlikely_skin(albedo) + self.model.prior(params, solver.settings.priors)[0]
 
-    def unlikely_skin(self) -> float:
-        """What the prior on skin costs for the present albedo."""
-        return 0.0 if self.skin is None else self.skin.cost(_log_of(self.albedo))
+    def unlikely_skin(self, albedo: torch.Tensor) -> float:
+        """What the prior on skin costs for an albedo [3, P, 1]."""
+        return 0.0 if self.skin is None else self.skin.cost(_log_of(albedo))
 
     def _specular_prior(self) -> tuple[float, float]:
         """Mean and precision of the specular intensity."""
@@ -206,7 +205,9 @@ class LightStep:
         )
         whole = level(solved)
         longest = max(whole.max() / _LARGEST_RISE, -whole.min() / _LARGEST_FALL, 1.0)
-        steps = [level(np.clip(whole, -_LARGEST_FALL, _LARGEST_RISE)), whole / longest]
+        steps = [whole]
+        if longest > 1.0:
+            steps = [level(np.clip(whole, -_LARGEST_FALL, _LARGEST_RISE)), whole / longest]
         self.before = self.cost(state.params)
         for halving in 0.5 ** np.arange(6):
             costs = [self.cost(state.params + halving * step) for step in steps]
