@@ -130,6 +130,25 @@ def test_a_ladder_goes_on_where_it_stands(glossy):
     assert ladder.climb() is before and len(records) == count
 
 
+@pytest.mark.parametrize("alone", [False, True])
+def test_where_shadows_do_not_serve_all_parts_are_tried_at_once(monkeypatch, alone):
+    """alone: shadows serve by themselves, so that there is nothing to leap for."""
+    frames, records = np.random.default_rng(0).uniform(0.9, 1.1, 9), []
+    whole = Model("bounces", "one_value", "cubemap_8")
+
+    def tried(self, model, start):
+        error = 0.5 if model == whole else 0.7 if alone and model.visibility == "bounces" else 1.0
+        return Trial(model, None, error * frames, 0.1)
+
+    monkeypatch.setattr(Ladder, "_try", lambda self, model, start: replace(tried(self, model, start), solution=start))
+    found = Ladder({}, CAREFUL, allowed_rungs(CAREFUL), records.append).climb()
+    leaps = [record for record in records if record["part"] == "leap"]
+    assert len(leaps) == (not alone) and (alone or found.model == whole)
+    if not alone:
+        assert leaps[0]["rung"] == "bounces, one_value, cubemap_8" and leaps[0]["climbed"]
+        assert records[-1]["rung"] == "cubemap_16"  # and the climb goes on from there
+
+
 def test_the_fall_is_paired_by_frame():
     """Frames differ by far more than the models do: only the differences count."""
     rng = np.random.default_rng(0)
@@ -198,8 +217,8 @@ def climb_meshes(monkeypatch, qualities, **settings):
     """What the clip's ladder leads to if a mesh of each number of subdivisions leaves so much noise."""
     capture, asked = make_truth(specular=0.0)[0], []
 
-    def reshape(tracked, frames, known, appearance, sizes, shape, progress, note, begun):
-        asked.append((shape.subdivisions, begun))
+    def reshape(tracked, frames, known, appearance, sizes, shape, progress, note):
+        asked.append(shape.subdivisions)
         return SimpleNamespace(**{**vars(tracked), "capture": noisy(capture, qualities[1 + shape.subdivisions]),
                                   "mesh": f"level {shape.subdivisions}"})
 
@@ -212,20 +231,27 @@ def climb_meshes(monkeypatch, qualities, **settings):
 
 
 def test_the_mesh_is_refined_as_far_as_it_serves(one_thread, monkeypatch):
-    climbed, asked = climb_meshes(monkeypatch, (0.02, 0.005, 0.02))
-    assert climbed.inputs.mesh == "level 0" and climbed.settings.shape is None
-    assert asked == [(0, None), (1, "level 0")]  # the second goes on where the first ended
+    climbed, asked = climb_meshes(monkeypatch, (0.02, 0.02, 0.005))
+    assert climbed.inputs.mesh == "level 1" and climbed.settings.shape is None
+    assert asked == [1]
     assert climbed.shape_record["refined"]
     assert climbed.shape_record["held_out"]["after"] < 0.5 * climbed.shape_record["held_out"]["before"]
     meshes = [(rung["rung"], rung["climbed"]) for rung in climbed.rungs if rung["part"] == "geometry"]
-    assert meshes == [("refined", True), ("subdivided_1", False)]
+    assert meshes == [("subdivided_1", True)]
     assert climbed.settings.appearance.specular is False and climbed.start.held_out > 0.0
 
 
+def test_a_coarser_mesh_is_tried_where_the_finest_does_not_serve(one_thread, monkeypatch):
+    climbed, asked = climb_meshes(monkeypatch, (0.02, 0.005, 0.02))
+    assert climbed.inputs.mesh == "level 0" and asked == [1, 0]
+    meshes = [(rung["rung"], rung["climbed"]) for rung in climbed.rungs if rung["part"] == "geometry"]
+    assert meshes == [("subdivided_1", False), ("refined", True)]
+
+
 def test_a_tracked_mesh_that_no_refinement_improves_stays(one_thread, monkeypatch):
-    climbed, asked = climb_meshes(monkeypatch, (0.01, 0.01, 0.005))
+    climbed, asked = climb_meshes(monkeypatch, (0.01, 0.01, 0.01))
     assert climbed.inputs.mesh is None and climbed.shape_record == {"refined": False}
-    assert asked == [(0, None)]
+    assert asked == [1, 0]
 
 
 def test_too_few_held_out_frames_choose_no_model(one_thread, monkeypatch):

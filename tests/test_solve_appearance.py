@@ -339,6 +339,17 @@ def test_roughness_search_moves_towards_the_truth(truth):
         assert abs(np.log(found / ROUGHNESS)) < 0.6 * abs(np.log(start / ROUGHNESS))
 
 
+def test_light_between_surfaces_that_send_everything_on_comes_to_an_end(truth):
+    """As the albedo of a channel does at its bound, under a light that cannot explain the clip."""
+    capture = truth[0]
+    count = len(capture.nodes.points)
+    closed = replace(capture.node_transfer, bounce=np.full((count, count), 1.0 / count, np.float32))
+    solver = AppearanceSolver(replace(capture, node_transfer=closed), Settings(specular=False))
+    solver.state.node_albedo[:] = 1.0
+    solver.bake()
+    assert torch.isfinite(solver.baked).all() and (solver.baked >= solver.direct).all()
+
+
 def test_nodes_take_the_albedo_of_points_beside_them(truth):
     capture, _, _ = truth
     solver = AppearanceSolver(capture, MATTE)

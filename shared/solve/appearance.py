@@ -21,9 +21,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from shared.brdf import hemispherical_albedo
 from shared.lobe_tables import specular_tables
 from shared.lobes import LobeTable
+from shared.shading import Material
 from shared.solve.capture import Capture
 from shared.solve.light import FrameLight, LightPriors
 from shared.solve.light_models import LightModel, make_light_model
@@ -186,12 +186,11 @@ class AppearanceSolver(SampleErrors):
         """Transfer with all diffuse bounces for the present albedo [3, P, J]."""
         self.baked = self.direct[None].expand(3, -1, -1)
         if self.settings.bounce:
-            returned = self.state.specular * hemispherical_albedo(round(self.state.roughness, 3))
-            effective = self.state.node_albedo + returned
+            share = Material(self.state.node_albedo, self.state.specular, self.state.roughness).bounce_albedo()
             # node_radiosity @ direct, without the matrix in between
             form, node_direct = (torch.from_numpy(table.astype(np.float32))
                                  for table in (self.capture.node_transfer.bounce, self.capture.node_transfer.direct))
-            albedo = torch.from_numpy(effective.T.astype(np.float32))[..., None]
+            albedo = torch.from_numpy(share.T.astype(np.float32))[..., None]
             radiosity = torch.linalg.solve(torch.eye(len(form)) - albedo * form, albedo * node_direct)
             self.baked = self.direct + torch.from_numpy(self.capture.transfer.bounce.astype(np.float32)) @ radiosity
 

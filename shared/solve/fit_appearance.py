@@ -58,10 +58,11 @@ def fit_appearance(
     report: Callable[[dict], None] = lambda record: None,
     start: Solution | None = None,
     keep_start: bool = False,
+    least: int = 1,
 ) -> Solution:
     """Fits light, albedo, specular intensity and roughness; report receives each step's record. start: the solution of
     a capture much like this one, from which only the last resolution is gone through again; keep_start: its light as it
-    is may win, too.
+    is may win, too; least: steps from it before one that serves little may be the last.
 
     The first steps only give the light its shape; highlights, which then begin to say something about the scale,
     take part from the fourth, but not again after a step that had to be undone. Only states after the first steps, of
@@ -81,7 +82,7 @@ def fit_appearance(
         last, searches = np.inf, 0
         worthwhile = _WORTHWHILE if stage == len(schedule) - 1 else _WORTHWHILE_COARSE
         shaping_steps = min(SHAPING_STEPS, settings.steps - 1) if stage == 0 and start is None else 0
-        least = (shaping_steps + 2 if stage == 0 else 1) + keep_start
+        enough = shaping_steps + 2 if stage == 0 and start is None else least
         kept = None
         for number in range(settings.steps):
             shaping = number < shaping_steps
@@ -103,10 +104,10 @@ def fit_appearance(
                 best = (judged, record, _copy(solver.state), by_frame)
             settled = judged > last * (1.0 - _SETTLED)
             wanted = settings.specular and settings.search_roughness and number + 1 < settings.steps
-            if wanted and settled and searches < ROUGHNESS_SEARCHES[min(stage, 1)]:
+            if wanted and settled and searches < ROUGHNESS_SEARCHES[0 if stage == 0 and start is None else 1]:
                 solver.state.roughness, solver.lobes = search_roughness(solver), None
                 searches += 1
-            elif not shaping and number >= least and judged > last * (1.0 - worthwhile):
+            elif not shaping and number >= enough and judged > last * (1.0 - worthwhile):
                 break
             last = judged
     _, record, state, by_frame = best

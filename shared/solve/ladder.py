@@ -5,14 +5,14 @@ Each part of the model has rungs of its own, from the least to the most:
     visibility  off, on, bounces
     specular    none, one_value; by_segment, local (ladder_gloss)
     light       harmonics_2, sun_sky, harmonics_4, cubemap_8, cubemap_16, cubemap_32
-    geometry    tracked, refined, subdivided (ladder_clip)
+    geometry    tracked, refined, subdivided (ladder_clip: from the finest down)
     roughness   one_value; by_segment, local (ladder_gloss)
 
 The climb starts at the bottom of all and tries the next rung of one part after the other, each from the solution
 below it, until no part climbs any more. A rung is climbed if the mean absolute error on held-out frames, paired frame
 by frame, falls by more than its standard error; where a rung brings unknowns, also by more than a step of the solver
 that is worth while. Rungs are not all nested (a sun in the sky is no special case of harmonics), so that the one beyond
-a rung that did not serve is tried, too.
+a rung that did not serve is tried, too, and where the climb ends without shadows, all parts at once.
 
 References: Breiman et al., Classification and regression trees, 1984, 3.4.3 (the one-standard-error rule).
 """
@@ -47,7 +47,8 @@ PARTS = ("visibility", "specular", "light", "geometry", "roughness")
 """What can be forced."""
 FEWEST_HELD_OUT = 3
 """Frames, below which differences between them have no standard error."""
-CLIMB_STEPS = 8
+CLIMB_STEPS, MOVES = 8, 2
+"""Most steps on a rung, and so many at least: the first from a light of another model can lead uphill."""
 LOOK_AHEAD = 2
 
 
@@ -131,9 +132,30 @@ class Ladder:
         if self.present is None:
             self.begin(Model(**{part: names[0] for part, names in self.rungs.items()}))
             self.report(describe("start", ", ".join(self.present.model), self.present))
+        self._climb_parts()
+        if self.present.model.visibility != self.rungs["visibility"][-1] and self._leap():
+            self._climb_parts()
+        return self.present
+
+    def _climb_parts(self) -> None:
         while any([self._climb_part(part) for part in self.rungs]):
             pass
-        return self.present
+
+    def _leap(self) -> bool:
+        """All parts at once, from a uniform light: shadows that cost nothing and yet do not serve mean that the climb
+        stands where no single part leads out, as under one hard lamp."""
+        lights = self.rungs["light"]
+        model = Model(self.rungs["visibility"][-1], self.rungs["specular"][-1],
+                      next((name for name in lights if name.startswith("cubemap")), lights[-1]))
+        if model in self.tried:
+            return False
+        self.tried.add(model)
+        trial = self._try(model, None)
+        better = serves(self.present.errors, trial.errors)
+        self.report(describe("leap", ", ".join(model), trial, self.present, better))
+        if better:
+            self.present = trial
+        return better
 
     def begin(self, model: Model, start: Solution | None = None) -> None:
         """Solves a model to climb from, from a solution or from a uniform light."""
@@ -184,7 +206,7 @@ class Ladder:
         if settings.specular and start.state.specular == 0.0:
             fresh = replace(start.state, specular=settings.specular_prior[0], roughness=settings.roughness)
             start = replace(start, state=fresh, trusted=True)
-        solution = fit_appearance(capture, settings, start=start, keep_start=keep_start)
+        solution = fit_appearance(capture, settings, start=start, keep_start=keep_start, least=MOVES)
         errors = solution.frame_errors[~capture.fitted]
         return Trial(model, solution, errors, time.perf_counter() - begun)
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shared.gather import SurfaceViewer
+from shared.solve.appearance import Capture
 from shared.solve.capture import Sizes, hold_out, set_scenery, spread_frames
 from shared.solve.fit_appearance import Solution
 from shared.solve.inverse_problem import InverseInputs, InverseSettings, capture_skin, frames_of
@@ -35,6 +36,18 @@ class Climbed:
     rungs: tuple[dict, ...] = ()
 
 
+class Made(dict):
+    """Values that are made when they are first asked for."""
+
+    def __init__(self, make: Callable):
+        super().__init__()
+        self._make = make
+
+    def __missing__(self, key):
+        value = self[key] = self._make(key)
+        return value
+
+
 class SmallClip:
     """A clip's captures with few points, frames and directions, from one mesh: with visibility (True) and without."""
 
@@ -42,15 +55,16 @@ class SmallClip:
         self.inputs, full = inputs, settings.sizes
         self.sizes = Sizes(*(min(getattr(full, name), getattr(CLIMB_SIZES, name)) for name in vars(CLIMB_SIZES)))
         viewer = SurfaceViewer.of(inputs.mesh)
-        self.scenery = {on: set_scenery(viewer, self.sizes, on) for on in (False, True)}
+        self.scenery = Made(lambda visibility: set_scenery(viewer, self.sizes, visibility))
         frames = frames_to_climb(inputs, settings, fitted)
         moves, count = settings.appearance.light_moves(inputs.moves), self.sizes.points
         seen = capture_skin(inputs, viewer, self.scenery[True], frames, moves, count, progress)
-        seen, bare = replace(seen, chart=chart), self.scenery[False]
-        self.captures = {
-            True: seen,
-            False: replace(seen, transfer=bare.trace(seen.points), node_transfer=bare.node_transfer),
-        }
+        self.captures = Made(self._without_visibility)
+        self.captures[True] = replace(seen, chart=chart)
+
+    def _without_visibility(self, visibility: bool) -> Capture:
+        seen, bare = self.captures[True], self.scenery[visibility]
+        return replace(seen, transfer=bare.trace(seen.points), node_transfer=bare.node_transfer)
 
 
 def frames_to_climb(
@@ -98,9 +112,11 @@ class _Climber:
             self._climb_gloss()
 
     def _climb_geometry(self, shape: ShapeSettings) -> None:
+        """The finest mesh first, since rungs up to it, each with captures of its own, cost a third more and end no
+        better; coarser ones where it does not serve."""
         before = self.ladder.present
-        for subdivisions in range(shape.subdivisions + 1):
-            if not self._refine(replace(shape, subdivisions=subdivisions)):
+        for subdivisions in range(shape.subdivisions, -1, -1):
+            if self._refine(replace(shape, subdivisions=subdivisions, looks_back=False)):
                 break
         if self.small is not self.tracked:
             after = self.ladder.present
@@ -118,20 +134,18 @@ class _Climber:
         self.gloss = GlossLadder(capture, applied, present, segment, rungs, self._report).climb()
 
     def _refine(self, shape: ShapeSettings) -> bool:
-        """Refines the tracked mesh, or goes on refining it, under the present solution; kept where that serves."""
-        begun = time.perf_counter()
+        """Refines the tracked mesh under the present solution; kept where that serves."""
+        start = time.perf_counter()
         below, tracked = self.ladder.present, self.tracked.inputs
         appearance = below.model.applied(self.settings.appearance)
         known = Reflectance.of(below.solution, self.small.scenery[appearance.visibility])
         frames = frames_of(tracked, self.settings, shape.frames, self.fitted)
         how = appearance, self.small.sizes, shape, self.progress, self.note
-        mesh = None if self.small is self.tracked else self.small.inputs.mesh
-        small = SmallClip(
-            reshape(tracked, frames, known, *how, begun=mesh), self.settings, self.fitted, self.chart, self.progress
-        )
+        reshaped = reshape(tracked, frames, known, *how)
+        small = SmallClip(reshaped, self.settings, self.fitted, self.chart, self.progress)
         ladder = self._ladder(small)
         ladder.begin(below.model, below.solution)
-        trial = replace(ladder.present, seconds=time.perf_counter() - begun)
+        trial = replace(ladder.present, seconds=time.perf_counter() - start)
         better = "geometry" in self.forced or serves(below.errors, trial.errors)
         name = "refined" if shape.subdivisions == 0 else f"subdivided_{shape.subdivisions}"
         self._report(describe("geometry", name, trial, below, better))
@@ -154,7 +168,8 @@ class _Climber:
         """What is left to solve."""
         present, settings, forced = self.ladder.present, self.settings, self.forced
         appearance = present.model.applied(settings.appearance)
-        appearance = replace(appearance, local_roughness=appearance.local_roughness and "roughness" in forced)
+        local = appearance.local_roughness and "roughness" in forced
+        appearance = replace(appearance, local_roughness=local, search_roughness=False)  # the ladder found it
         widths = settings.specular_widths if "specular" in forced else POOLING[self.gloss.specular]
         settings = replace(settings, appearance=appearance, shape=None, specular_widths=widths)
         found = self.gloss, self.shape_record, tuple(self.rungs)

@@ -97,10 +97,8 @@ def reshape(
     settings: ShapeSettings,
     progress: Callable,
     note: Callable,
-    begun: Mesh | None = None,
 ) -> Reshaped:
-    """The inputs with their mesh refined under a known light; frames: which, and which of them are fitted; begun: their
-    mesh as it was refined with fewer subdivisions, from where this goes on."""
+    """The inputs with their mesh refined under a known light; frames: which, and which of them are fitted."""
     chosen, fitted = frames
     tracks = None
     if inputs.tracks is not None:
@@ -115,7 +113,7 @@ def reshape(
         inputs.light_index[chosen],
     )
     solver = ShapeSolver(clip, reflectance, appearance, sizes, settings, progress, note)
-    start, refined = solver.refine(inputs.mesh, faces_of(inputs, SHAPED), faces_of(inputs, HELD), begun)
+    start, refined = solver.refine(inputs.mesh, faces_of(inputs, SHAPED), faces_of(inputs, HELD))
     placed = move_without_crossing(start.vertices, refined.vertices, refined.faces)
     undone = (np.abs(placed - refined.vertices).max(1) > 1e-6).sum()
     if undone:

@@ -48,7 +48,8 @@ BLUR_EDGES = 0.4
 class ShapeSettings:
     """subdivisions: finer levels beyond the given mesh; rounds: most steps per level; frames: that the shape is solved
     from; smoothness: lambda of the large steps; sigma_mm: how far the surface may be from the start as a whole; rim:
-    how the outline is met first, None: it is not."""
+    how the outline is met first, None: it is not; looks_back: the last step of a level is judged, too, and not only the
+    mesh by whoever asked for it."""
 
     subdivisions: int = 1
     rounds: int = 2
@@ -57,6 +58,7 @@ class ShapeSettings:
     sigma_mm: float = 8.0
     equations: EquationSettings = field(default_factory=EquationSettings)
     rim: RimSettings | None = field(default_factory=RimSettings)
+    looks_back: bool = True
 
 
 @dataclass(frozen=True)
@@ -226,19 +228,13 @@ class ShapeSolver:
         largest = LARGEST_STEP_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
         return np.clip(offsets, -largest, largest)
 
-    def refine(
-        self, mesh: Mesh, shaped: np.ndarray, held: np.ndarray, begun: Mesh | None = None
-    ) -> tuple[Mesh, Mesh]:
-        """The mesh subdivided as the settings say, as it was and refined. shaped, held [faces] bool; begun: the mesh,
-        or a subdivision of it, as it was refined before: goes on from the next one."""
-        start, mesh, traced = mesh, mesh if begun is None else begun, None
+    def refine(self, mesh: Mesh, shaped: np.ndarray, held: np.ndarray) -> tuple[Mesh, Mesh]:
+        """The mesh subdivided as the settings say, as it was and refined. shaped, held [faces] bool."""
+        start, traced = mesh, None
         for level in range(self.settings.subdivisions + 1):
             if level > 0:
-                shaped, held, start = np.repeat(shaped, 4), np.repeat(held, 4), subdivide(start)
-            if begun is not None and len(begun.faces) >= len(start.faces):
-                continue
-            if len(mesh.faces) < len(start.faces):
-                mesh = subdivide(mesh)
+                shaped, held = np.repeat(shaped, 4), np.repeat(held, 4)
+                start, mesh = subdivide(start), subdivide(mesh)
             traced = self.trace(mesh, shaped, traced)
             mesh = self._refine_level(mesh, start.vertices, shaped, held, level, traced)
         return start, mesh
@@ -249,10 +245,12 @@ class ShapeSolver:
             self.note(f"shape level {level}: too little of the face is seen, the mesh stays")
             return mesh
         self.note(f"shape level {level}: {len(surface.index)} points, {_residuals(surface)}")
-        for _ in range(self.settings.rounds):
+        for number in range(self.settings.rounds):
             offsets = self.step(surface, start, shaped, held)
             normals = vertex_normals(surface.mesh.vertices, surface.mesh.faces)
             vertices = surface.mesh.vertices + offsets[:, None] * normals
+            if number + 1 == self.settings.rounds and not self.settings.looks_back:
+                return mesh.replace(vertices=vertices)
             moved = self.examine(mesh.replace(vertices=vertices), shaped, traced)
             if moved is None:
                 break
