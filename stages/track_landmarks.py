@@ -17,7 +17,7 @@ from shared.contract import Job, Output, Parameter, Stage, main
 
 STAGE = Stage(
     name="track_landmarks",
-    version=5,
+    version=6,
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
     given=("landmarks", "poses"),

@@ -53,6 +53,13 @@ def test_good_clip_has_neither_reasons_nor_warnings():
     assert warnings(track) == []
 
 
+def test_held_poses_are_doubted_where_the_skin_moves_otherwise():
+    doubted = warnings(good_track(held_off=(np.radians(1.0), np.radians(0.2))))
+    assert len(doubted) == 1 and "1.0 degrees otherwise" in doubted[0] and "hold_poses" in doubted[0]
+    assert warnings(good_track(held_off=(np.radians(1.0), np.radians(0.4)))) == []  # the tracks don't know it
+    assert warnings(good_track(held_off=(np.radians(0.2), np.radians(0.02)))) == []  # theirs may be the better ones
+
+
 def test_frame_with_too_few_tracks_is_named():
     reliable = np.arange(FRAMES) != 3
     error = good_track().error_px

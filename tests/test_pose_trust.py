@@ -137,3 +137,19 @@ def test_held_poses_stay():
     trusted = trust(clip_of(hold_poses=True), all_reliable(tracks, held), PRIOR_MM, estimate_focal=True)
     assert np.array_equal(trusted.adjusted.solution.camera_from_points, turn())
     assert not trusted.focal_solved and np.isfinite(trusted.covariance).all()
+    off, known = trusted.held_off
+    assert off < 3 * known < np.radians(0.3)
+
+
+def test_held_poses_that_the_tracks_contradict_are_uncertain_by_as_much():
+    tracks, solution = solved()
+    errors = np.radians(1.0) * np.sin(np.arange(FRAMES))[:, None] * [0.6, 0.8, 0.0]
+    wrong = np.array(turn())
+    wrong[:, :3, :3] = wrong[:, :3, :3] @ rotation_from_vector(errors)
+    held = all_reliable(tracks, BundleSolution(wrong, solution.points, solution.residuals_px))
+    trusted = trust(clip_of(hold_poses=True), held, PRIOR_MM, estimate_focal=False)
+    off, known = trusted.held_off
+    assert off == pytest.approx(np.sqrt((errors**2).sum(1).mean()), rel=0.15) and off > 3 * known
+    deviation = np.sqrt(np.trace(trusted.covariance[:, :3, :3], axis1=1, axis2=2))
+    assert np.corrcoef(deviation, np.linalg.norm(errors, axis=1))[0, 1] > 0.9
+    assert trust(clip_of(), held, PRIOR_MM, estimate_focal=False).held_off is None

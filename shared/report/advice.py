@@ -18,6 +18,9 @@ _ADVICE = (
      "Correct the lens in subject.yaml; cropping and stabilisation in the camera lengthen it too."),
     (r"beside the shared mesh",
      "Give each clip its own lens in subject.yaml, and clips with one neutral expression; else solve them one by one."),
+    (r"poses given",
+     "Check frame numbers, axes and the direction of the transforms (docs/files.md); poses that are only roughly right "
+     "serve as a start with hold_poses: false."),
     (r"focal|lens|sensor", "Give the lens in subject.yaml (camera: focal_length_mm and sensor_width_mm)."),
     (r"faces in the clip",
      "Look at the contact sheet; if it shows the wrong person, crop the clip or film one person."),

@@ -6,11 +6,13 @@ import numpy as np
 
 from shared.geometry import camera_centres
 from shared.mesh import normalised
-from shared.solve.pose_trust import FOCAL_DEVIATIONS
+from shared.solve.pose_trust import FOCAL_DEVIATIONS, HELD_DEVIATIONS
 from shared.solve.track_head import HeadTrack
 
 SMALL_ROTATION_DEG = 15.0
 FOCAL_TOLERANCE = 0.03
+HELD_TOLERANCE_DEG = 0.3
+"""Poses of another tracker may differ from ours by so much: either may be the wrong ones."""
 MOUTH_RATIO = 2.0
 """Tracks around the mouth that fit so many times worse than the rest mean talk or a smile that comes and goes."""
 
@@ -71,6 +73,13 @@ def warnings_of(
             f"the tracks ask for a focal length {100 * (gain - 1):+.0f} % off the given one (deviation "
             f"{100 * deviation:.1f} %): check focal length and sensor width in subject.yaml, and digital zoom"
         )
+    if track.held_off is not None:
+        off_deg, known_deg = np.degrees(track.held_off)
+        if off_deg > max(HELD_DEVIATIONS * known_deg, HELD_TOLERANCE_DEG):
+            warnings.append(
+                f"the poses given turn the head {off_deg:.1f} degrees otherwise than its skin moves (known to "
+                f"{known_deg:.1f}): check them, or let them be refined (tracking.hold_poses: false)"
+            )
     ratio = mouth_ratio(track, fits, lips_head)
     if ratio > MOUTH_RATIO:
         warnings.append(

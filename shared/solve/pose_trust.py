@@ -33,6 +33,8 @@ which more frames don't lessen. Measured on synthesised clips: 0.001 to 0.004.""
 
 LARGEST_FOCAL_DEVIATION = 0.05
 FOCAL_DEVIATIONS = 3.0
+HELD_DEVIATIONS = 3.0
+"""Held poses that the tracks contradict by so many deviations are doubted."""
 
 CHI_SQUARED_MEDIAN_3 = 2.366
 
@@ -42,7 +44,8 @@ class TrustedPoses:
     """The last solution of the reliable frames: covariance [F, 6, 6] (NaN elsewhere), noise_factor, the lens's check.
 
     focal_gain and focal_deviation: solved over given, had it been left free, and the logarithm's standard deviation;
-    focal_solved: the poses belong to the solved one.
+    focal_solved: the poses belong to the solved one. held_off: of poses that were held, rms angle by which the tracks turn
+    the head otherwise, and what that is known to, radians; None: none were held.
     """
 
     adjusted: Adjusted
@@ -51,6 +54,7 @@ class TrustedPoses:
     focal_gain: float
     focal_deviation: float
     focal_solved: bool
+    held_off: tuple[float, float] | None = None
 
 
 def noise_factor(
@@ -122,13 +126,18 @@ def trust(clip: TrackedClip, last: Adjusted, prior_mm: float, estimate_focal: bo
     covariance[shown] = known.poses
     turn = _turns(solved.camera_from_points[:, :3, :3])
     covariance[shown, :3, :3] += SHADING_SLIP**2 * turn[:, :, None] * turn[:, None, :]
-    if not solve_focal and abs(np.log(free.focal_gain)) > FOCAL_DEVIATIONS * uncertain.log_focal:
-        # the tracks contradict the lens: the poses are as uncertain as the two answers are apart
-        apart = rotations_apart(solved.camera_from_points[:, :3, :3], free.camera_from_points[:, :3, :3])
+    apart = rotations_apart(solved.camera_from_points[:, :3, :3], free.camera_from_points[:, :3, :3])
+    held_off = None
+    if clip.hold_poses:
+        known_to = np.trace(uncertain.poses[:, :3, :3], axis1=1, axis2=2)
+        held_off = float(np.sqrt((apart**2).sum(1).mean())), float(np.sqrt(known_to.mean()))
+    lens_is_off = not solve_focal and abs(np.log(free.focal_gain)) > FOCAL_DEVIATIONS * uncertain.log_focal
+    if lens_is_off or held_off and held_off[0] > HELD_DEVIATIONS * held_off[1]:
+        # the tracks contradict the lens or the poses: these are as uncertain as the two answers are apart
         covariance[shown, :3, :3] += apart[:, :, None] * apart[:, None, :]
     every = np.array(solution.camera_from_points)
     every[shown] = solved.camera_from_points
     residuals = np.full(solution.residuals_px.shape, np.nan)
     residuals[shown] = solved.residuals_px
     final = Adjusted(BundleSolution(every, solved.points, residuals, solved.focal_gain), last.tracks, shown)
-    return TrustedPoses(final, covariance, factor, free.focal_gain, uncertain.log_focal, solve_focal)
+    return TrustedPoses(final, covariance, factor, free.focal_gain, uncertain.log_focal, solve_focal, held_off)

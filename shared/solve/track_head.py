@@ -67,7 +67,8 @@ class HeadTrack:
     each track point, NaN where not seen; reliable [F]: enough tracks.
     noise_factor: see shared.solve.pose_trust. focal_gain, focal_deviation: the focal length over the given one had it
     been solved, and the deviation of its logarithm; focal_solved: the result belongs to the solved one. held_out_px:
-    median error of tracks kept aside, under the poses before and after the last fine pass.
+    median error of tracks kept aside, under the poses before and after the last fine pass. held_off: see
+    shared.solve.pose_trust.
     """
 
     camera_from_head: np.ndarray
@@ -82,6 +83,7 @@ class HeadTrack:
     focal_deviation: float
     focal_solved: bool
     held_out_px: tuple[float, float]
+    held_off: tuple[float, float] | None = None
 
 
 def track_head(
@@ -135,6 +137,7 @@ def track_head(
         focal_deviation=trusted.focal_deviation,
         focal_solved=trusted.focal_solved,
         held_out_px=held_out,
+        held_off=trusted.held_off,
     )
 
 
