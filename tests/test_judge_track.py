@@ -31,6 +31,7 @@ def good_track(**changes):
         covariance=np.tile(np.eye(6), (FRAMES, 1, 1)),
         fit=None,
         points_head=points,
+        sigma_mm=np.full(POINTS, 0.2),
         error_px=rng.uniform(0.1, 0.2, (FRAMES, POINTS)),
         reliable=np.ones(FRAMES, bool),
         noise_factor=2.0,
