@@ -112,8 +112,8 @@ class _Climber:
             self._climb_gloss()
 
     def _climb_geometry(self, shape: ShapeSettings) -> None:
-        """The finest mesh first, since rungs up to it, each with captures of its own, cost a third more and end no
-        better; coarser ones where it does not serve."""
+        """The finest mesh first, since rungs up to it need captures of their own and end no better; coarser ones where
+        it does not serve."""
         before = self.ladder.present
         for subdivisions in range(shape.subdivisions, -1, -1):
             if self._refine(replace(shape, subdivisions=subdivisions, looks_back=False)):
