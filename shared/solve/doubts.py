@@ -31,9 +31,9 @@ ORIENTED_ALBEDO, UNLIKELY_COLOUR = 0.3, 3.0
 """Good clips have 0.03 to 0.26 and 0.5 to 1.4; a third of the light moving along gives 0.3 to 0.5."""
 BIWEIGHT_REACH, ROBUST_ROUNDS, SKIN_SPREAD = 4.685 * 1.4826, 12, (0.02, 0.1)
 """Of the logarithm of a person's skin: median deviations that are possible; more is hair, or light in the albedo."""
-COVERED, FAR_WORSE = 0.25, 3.0
+COVERED, FAR_WORSE = 0.35, 3.0
 """Share of a region's points, and how many times worse than the face's median they fit: 0 to 0.1 without anything
-before the skin, 0.4 with glasses, 0.5 with a fringe."""
+before the skin (0.3 where a lamp moves with the head), 0.4 with glasses, 0.5 with a fringe."""
 NEAR_EYES_MM, FEWEST_POINTS = 30.0, 20
 POINTS = 500
 LEAST_MODEL = 0.01
