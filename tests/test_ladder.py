@@ -217,8 +217,8 @@ def climb_meshes(monkeypatch, qualities, **settings):
     """What the clip's ladder leads to if a mesh of each number of subdivisions leaves so much noise."""
     capture, asked = make_truth(specular=0.0)[0], []
 
-    def reshape(tracked, frames, known, appearance, sizes, shape, progress, note):
-        asked.append(shape.subdivisions)
+    def reshape(tracked, frames, known, appearance, sizes, shape, progress, note, begun):
+        asked.append((shape.subdivisions, begun and begun.mesh))
         return SimpleNamespace(**{**vars(tracked), "capture": noisy(capture, qualities[1 + shape.subdivisions]),
                                   "mesh": f"level {shape.subdivisions}"})
 
@@ -231,27 +231,20 @@ def climb_meshes(monkeypatch, qualities, **settings):
 
 
 def test_the_mesh_is_refined_as_far_as_it_serves(one_thread, monkeypatch):
-    climbed, asked = climb_meshes(monkeypatch, (0.02, 0.02, 0.005))
-    assert climbed.inputs.mesh == "level 1" and climbed.settings.shape is None
-    assert asked == [1]
+    climbed, asked = climb_meshes(monkeypatch, (0.02, 0.005, 0.02))
+    assert climbed.inputs.mesh == "level 0" and climbed.settings.shape is None
+    assert asked == [(0, None), (1, "level 0")]  # the second goes on where the first ended
     assert climbed.shape_record["refined"]
     assert climbed.shape_record["held_out"]["after"] < 0.5 * climbed.shape_record["held_out"]["before"]
     meshes = [(rung["rung"], rung["climbed"]) for rung in climbed.rungs if rung["part"] == "geometry"]
-    assert meshes == [("subdivided_1", True)]
+    assert meshes == [("refined", True), ("subdivided_1", False)]
     assert climbed.settings.appearance.specular is False and climbed.start.held_out > 0.0
 
 
-def test_a_coarser_mesh_is_tried_where_the_finest_does_not_serve(one_thread, monkeypatch):
-    climbed, asked = climb_meshes(monkeypatch, (0.02, 0.005, 0.02))
-    assert climbed.inputs.mesh == "level 0" and asked == [1, 0]
-    meshes = [(rung["rung"], rung["climbed"]) for rung in climbed.rungs if rung["part"] == "geometry"]
-    assert meshes == [("subdivided_1", False), ("refined", True)]
-
-
 def test_a_tracked_mesh_that_no_refinement_improves_stays(one_thread, monkeypatch):
-    climbed, asked = climb_meshes(monkeypatch, (0.01, 0.01, 0.01))
+    climbed, asked = climb_meshes(monkeypatch, (0.01, 0.01, 0.005))
     assert climbed.inputs.mesh is None and climbed.shape_record == {"refined": False}
-    assert asked == [1, 0]
+    assert asked == [(0, None)]
 
 
 def test_too_few_held_out_frames_choose_no_model(one_thread, monkeypatch):

@@ -170,7 +170,7 @@ def test_dent_is_found(toy):
     # The dent is as wide as what is otherwise laid to light and pose.
     solver = solver_of(toy, subdivisions=0, rounds=4, smoothness=3.0, equations=EquationSettings(smooth_mm=0.0))
     depth = toy.start.vertices[toy.start.faces].mean(1)[:, 2]
-    _, refined = solver.refine(toy.start, depth > 20.0, depth < -40.0)
+    _, refined, _ = solver.refine(toy.start, depth > 20.0, depth < -40.0)
     normals = vertex_normals(toy.start.vertices, toy.start.faces)
     wrong = ((toy.start.vertices - toy.truth.vertices) * normals).sum(1)
     left = ((refined.vertices - toy.truth.vertices) * normals).sum(1)

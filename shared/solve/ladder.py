@@ -5,7 +5,7 @@ Each part of the model has rungs of its own, from the least to the most:
     visibility  off, on, bounces
     specular    none, one_value; by_segment, local (ladder_gloss)
     light       harmonics_2, sun_sky, harmonics_4, cubemap_8, cubemap_16, cubemap_32
-    geometry    tracked, refined, subdivided (ladder_clip: from the finest down)
+    geometry    tracked, refined, subdivided (ladder_clip)
     roughness   one_value; by_segment, local (ladder_gloss)
 
 The climb starts at the bottom of all and tries the next rung of one part after the other, each from the solution

@@ -112,11 +112,9 @@ class _Climber:
             self._climb_gloss()
 
     def _climb_geometry(self, shape: ShapeSettings) -> None:
-        """The finest mesh first, since rungs up to it need captures of their own and end no better; coarser ones where
-        it does not serve."""
         before = self.ladder.present
-        for subdivisions in range(shape.subdivisions, -1, -1):
-            if self._refine(replace(shape, subdivisions=subdivisions, looks_back=False)):
+        for subdivisions in range(shape.subdivisions + 1):
+            if not self._refine(replace(shape, subdivisions=subdivisions, looks_back=False)):
                 break
         if self.small is not self.tracked:
             after = self.ladder.present
@@ -134,14 +132,14 @@ class _Climber:
         self.gloss = GlossLadder(capture, applied, present, segment, rungs, self._report).climb()
 
     def _refine(self, shape: ShapeSettings) -> bool:
-        """Refines the tracked mesh under the present solution; kept where that serves."""
+        """Refines the tracked mesh, or goes on refining it, under the present solution; kept where that serves."""
         start = time.perf_counter()
-        below, tracked = self.ladder.present, self.tracked.inputs
+        below, tracked, below_is_tracked = self.ladder.present, self.tracked.inputs, self.small is self.tracked
         appearance = below.model.applied(self.settings.appearance)
         known = Reflectance.of(below.solution, self.small.scenery[appearance.visibility])
         frames = frames_of(tracked, self.settings, shape.frames, self.fitted)
         how = appearance, self.small.sizes, shape, self.progress, self.note
-        reshaped = reshape(tracked, frames, known, *how)
+        reshaped = reshape(tracked, frames, known, *how, begun=None if below_is_tracked else self.small.inputs)
         small = SmallClip(reshaped, self.settings, self.fitted, self.chart, self.progress)
         ladder = self._ladder(small)
         ladder.begin(below.model, below.solution)

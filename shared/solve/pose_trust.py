@@ -44,8 +44,8 @@ class TrustedPoses:
     """The last solution of the reliable frames: covariance [F, 6, 6] (NaN elsewhere), noise_factor, the lens's check.
 
     focal_gain and focal_deviation: solved over given, had it been left free, and the logarithm's standard deviation;
-    focal_solved: the poses belong to the solved one. held_off: of poses that were held, rms angle by which the tracks turn
-    the head otherwise, and what that is known to, radians; None: none were held.
+    focal_solved: the poses belong to the solved one. held_off: of poses that were held, rms angle by which the tracks
+    turn the head otherwise, and what that is known to, radians; None: none were held.
     """
 
     adjusted: Adjusted

@@ -11,7 +11,7 @@ from shared.intersections import move_without_crossing
 from shared.mesh import Mesh, subdivide
 from shared.solve.appearance import Settings
 from shared.solve.capture import Sizes, lens_of_frames
-from shared.solve.shape import HELD, SHAPED, Reflectance, ShapeClip, ShapeSettings, ShapeSolver
+from shared.solve.shape import HELD, SHAPED, Reflectance, ShapeClip, ShapeSettings, ShapeSolver, Traced
 from shared.solve.shape_step import TrackPoints
 from shared.solve.silhouette import Outlines, RimSettings, fit_outline, mask_distance
 
@@ -26,10 +26,10 @@ TRACK_FLOOR_MM = 0.1
 
 
 class Reshaped:
-    """A clip's inputs with another mesh in the place of theirs."""
+    """A clip's inputs with another mesh in the place of theirs; traced: what was looked up to refine it."""
 
-    def __init__(self, inputs, mesh: Mesh):
-        self._inputs, self.mesh = inputs, mesh
+    def __init__(self, inputs, mesh: Mesh, traced: Traced | None = None):
+        self._inputs, self.mesh, self.traced = inputs, mesh, traced
         self.face_segment = segments_of(inputs, mesh)
 
     def __getattr__(self, name: str):
@@ -97,8 +97,10 @@ def reshape(
     settings: ShapeSettings,
     progress: Callable,
     note: Callable,
+    begun: Reshaped | None = None,
 ) -> Reshaped:
-    """The inputs with their mesh refined under a known light; frames: which, and which of them are fitted."""
+    """The inputs with their mesh refined under a known light; frames: which, and which of them are fitted; begun: the
+    same with fewer subdivisions, from where this goes on."""
     chosen, fitted = frames
     tracks = None
     if inputs.tracks is not None:
@@ -113,9 +115,10 @@ def reshape(
         inputs.light_index[chosen],
     )
     solver = ShapeSolver(clip, reflectance, appearance, sizes, settings, progress, note)
-    start, refined = solver.refine(inputs.mesh, faces_of(inputs, SHAPED), faces_of(inputs, HELD))
+    so_far = None if begun is None else (begun.mesh, begun.traced)
+    start, refined, traced = solver.refine(inputs.mesh, faces_of(inputs, SHAPED), faces_of(inputs, HELD), so_far)
     placed = move_without_crossing(start.vertices, refined.vertices, refined.faces)
     undone = (np.abs(placed - refined.vertices).max(1) > 1e-6).sum()
     if undone:
         note(f"shape: {undone} vertices moved less than wanted, so that the surface does not cut itself")
-    return Reshaped(inputs, refined.replace(vertices=placed))
+    return Reshaped(inputs, refined.replace(vertices=placed), traced and traced.kept())

@@ -119,6 +119,10 @@ class Traced:
     views: list[SurfaceView]
     reflections: Reflections | None
 
+    def kept(self) -> Traced:
+        """What a finer level needs of it: neither pictures nor reflections."""
+        return replace(self, views=[], reflections=None)
+
     def turned_to(self, normals: np.ndarray) -> Transfer:
         """The transfer for other normals [P, 3] under the same visibility."""
         cosine = np.maximum(normals @ self.scenery.directions.T, 0.0) * (4.0 / len(self.scenery.directions))
@@ -228,16 +232,24 @@ class ShapeSolver:
         largest = LARGEST_STEP_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
         return np.clip(offsets, -largest, largest)
 
-    def refine(self, mesh: Mesh, shaped: np.ndarray, held: np.ndarray) -> tuple[Mesh, Mesh]:
-        """The mesh subdivided as the settings say, as it was and refined. shaped, held [faces] bool."""
-        start, traced = mesh, None
+    def refine(
+        self, mesh: Mesh, shaped: np.ndarray, held: np.ndarray, begun: tuple[Mesh, Traced] | None = None
+    ) -> tuple[Mesh, Mesh, Traced | None]:
+        """The mesh subdivided as the settings say, as it was and refined, and what was traced last. shaped, held
+        [faces] bool; begun: the mesh, or a subdivision of it, as it was refined before, with what was traced then: goes
+        on from the next one."""
+        start, (mesh, traced) = mesh, begun or (mesh, None)
+        finished = len(mesh.faces) if begun else 0
         for level in range(self.settings.subdivisions + 1):
             if level > 0:
-                shaped, held = np.repeat(shaped, 4), np.repeat(held, 4)
-                start, mesh = subdivide(start), subdivide(mesh)
+                shaped, held, start = np.repeat(shaped, 4), np.repeat(held, 4), subdivide(start)
+            if finished >= len(start.faces):
+                continue
+            if len(mesh.faces) < len(start.faces):
+                mesh = subdivide(mesh)
             traced = self.trace(mesh, shaped, traced)
             mesh = self._refine_level(mesh, start.vertices, shaped, held, level, traced)
-        return start, mesh
+        return start, mesh, traced
 
     def _refine_level(self, mesh, start, shaped, held, level, traced: Traced) -> Mesh:
         surface = self.examine(mesh, shaped, traced)
