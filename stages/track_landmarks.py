@@ -133,14 +133,14 @@ def excluded_frames(frames, used: np.ndarray, presence: np.ndarray, reasons: lis
 
 def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[dict]) -> dict:
     """tracking.json; its warnings also go to the log."""
-    from shared.solve.judge_track import rotation_range_deg, warnings_of
+    from shared.solve.judge_track import rotation_deviation_deg, rotation_range_deg, warnings_of
 
     lips = track.fit.vertices[np.unique(model.faces[model.segment("lips")])]
     warnings = warnings_of(track, fits, frames.count, frames.focal_known, lips)
     for warning in warnings:
         job.warn(warning)
     error = track.error_px[fits]
-    rotation = np.degrees(np.sqrt(np.trace(track.covariance[fits][:, :3, :3], axis1=1, axis2=2)))
+    rotation = rotation_deviation_deg(track, fits)
     return {
         "segments": list(model.segment_names),
         "excluded": excluded,

@@ -28,7 +28,7 @@ def good_track(**changes):
     points[:15] = LIPS[rng.integers(0, 3, 15)] + rng.uniform(-5, 5, (15, 3))
     track = HeadTrack(
         camera_from_head=turn(50.0),
-        covariance=np.tile(np.eye(6), (FRAMES, 1, 1)),
+        covariance=np.tile(1e-6 * np.eye(6), (FRAMES, 1, 1)),
         fit=None,
         points_head=points,
         sigma_mm=np.full(POINTS, 0.2),
@@ -59,6 +59,14 @@ def test_held_poses_are_doubted_where_the_skin_moves_otherwise():
     assert len(doubted) == 1 and "1.0 degrees otherwise" in doubted[0] and "hold_poses" in doubted[0]
     assert warnings(good_track(held_off=(np.radians(1.0), np.radians(0.4)))) == []  # the tracks don't know it
     assert warnings(good_track(held_off=(np.radians(0.2), np.radians(0.02)))) == []  # theirs may be the better ones
+
+
+def test_poses_that_are_hardly_known_are_said_to_be():
+    covariance = np.tile(np.radians(0.6) ** 2 / 3.0 * np.eye(6), (FRAMES, 1, 1))
+    unsure = warnings(good_track(covariance=covariance))
+    assert len(unsure) == 1 and "known to 0.6 degrees only" in unsure[0] and "compression" in unsure[0]
+    covariance[: FRAMES // 2 + 1] *= 0.25  # most frames are known well
+    assert warnings(good_track(covariance=covariance)) == []
 
 
 def test_frame_with_too_few_tracks_is_named():

@@ -18,6 +18,9 @@ _ADVICE = (
      "Correct the lens in subject.yaml; cropping and stabilisation in the camera lengthen it too."),
     (r"beside the shared mesh",
      "Give each clip its own lens in subject.yaml, and clips with one neutral expression; else solve them one by one."),
+    (r"rotation is known",
+     "Give the camera's own file, and film sharper, brighter and larger: light and shape can be no better than the "
+     "poses."),
     (r"poses given",
      "Check frame numbers, axes and the direction of the transforms (docs/files.md); poses that are only roughly right "
      "serve as a start with hold_poses: false."),

@@ -13,6 +13,8 @@ SMALL_ROTATION_DEG = 15.0
 FOCAL_TOLERANCE = 0.03
 HELD_TOLERANCE_DEG = 0.3
 """Poses of another tracker may differ from ours by so much: either may be the wrong ones."""
+UNSURE_DEG = 0.5
+"""Median deviation of the rotations: 0.2 to 0.4 in clips of a face 115 px high, less in larger ones."""
 MOUTH_RATIO = 2.0
 """Tracks around the mouth that fit so many times worse than the rest mean talk or a smile that comes and goes."""
 
@@ -42,6 +44,11 @@ def rotation_range_deg(camera_from_head: np.ndarray) -> float:
     """Largest angle between two frames' views of the head, in degrees."""
     directions = normalised(camera_centres(camera_from_head))
     return float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0))))
+
+
+def rotation_deviation_deg(track: HeadTrack, fits: np.ndarray) -> np.ndarray:
+    """Standard deviation of the rotation, in degrees, of each frame that fits [F] bool."""
+    return np.degrees(np.sqrt(np.trace(track.covariance[fits][:, :3, :3], axis1=1, axis2=2)))
 
 
 def mouth_ratio(track: HeadTrack, fits: np.ndarray, lips_head: np.ndarray) -> float:
@@ -80,6 +87,12 @@ def warnings_of(
                 f"the poses given turn the head {off_deg:.1f} degrees otherwise than its skin moves (known to "
                 f"{known_deg:.1f}): check them, or let them be refined (tracking.hold_poses: false)"
             )
+    deviation = rotation_deviation_deg(track, fits)
+    if np.median(deviation) > UNSURE_DEG:
+        warnings.append(
+            f"the head's rotation is known to {np.median(deviation):.1f} degrees only: too few pixels, blur, noise or "
+            "compression hide how the skin moves; light and shape follow it"
+        )
     ratio = mouth_ratio(track, fits, lips_head)
     if ratio > MOUTH_RATIO:
         warnings.append(
