@@ -19,7 +19,7 @@ from shared.geometry import camera_centres, projection_slope
 from shared.mesh import normalised
 
 PATCH_MM = 10.0
-"""Radius of the patches: errors of tracks farther apart go no longer along with each other."""
+"""Radius of the patches: tracks farther apart share no errors."""
 ROBUST_SCALE, CLIP = 1.4826, 3.0
 CAUCHY = 2.5
 LEAST_INFORMATION = 1e-6

@@ -40,7 +40,7 @@ class InverseInputs(Protocol):
 
     picture(f): frame f of F ready for sampling; mask(f) [H, W], 0: background; camera_from_head [F, 4, 4]; intrinsics
     [3, 3], or [F, 3, 3], and size (width, height) of the pictures; moves: "head" or "camera"; face_segment [faces] or
-    None where the mesh has no segments; tracks: points [N, 3] on the skin with their errors [N], px, or None;
+    None where the mesh has no segments; tracks: points [N, 3] on the skin with their errors [N] in depth, mm, or None;
     light_index [F]: which light each frame stands in, 0 first, frames of one light in a row.
     """
 
