@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import scipy.sparse as sparse
 from shapes import sphere
 from toy_head import toy_head
 
@@ -18,7 +19,7 @@ from shared.solve.capture import Sizes, set_scenery
 from shared.solve.shape import Reflectance, ShapeClip, ShapeSettings, ShapeSolver
 from shared.solve.shape_equations import EquationSettings, excess
 from shared.solve.shape_samples import tangent_frames
-from shared.solve.shape_step import TrackPoints, large_step_metric, normal_turns
+from shared.solve.shape_step import TrackPoints, large_step_metric, normal_turns, solve_offsets
 from shared.solve.shape_terms import Reflections, shading_terms
 from shared.transfer import mesh_points
 
@@ -135,6 +136,48 @@ def test_metric_is_the_squared_large_step():
     expected = np.square(values + 19.0 * laplacian).sum() / 4.0
     metric = large_step_metric(ball.faces, len(values), 19.0, 2.0)
     assert values @ metric @ values == pytest.approx(expected)
+
+
+def dented_ball(slope_at_top=-5.0):
+    """What solve_offsets is given for a ball one of whose vertices is pulled outwards, and its cost of offsets [V]."""
+    ball = sphere(1.0, 3)
+    count = len(ball.vertices)
+    normals = normalised(ball.vertices)
+    slope = np.zeros(count)
+    slope[0] = slope_at_top
+    hessian = sparse.identity(count, format="csr")
+    metric = large_step_metric(ball.faces, count, 19.0, 0.5)
+    given = ball.vertices, ball.vertices, normals, metric, np.ones(count, bool), [(hessian, slope)]
+
+    def cost(offsets):
+        moved = offsets[:, None] * normals
+        return 0.5 * offsets @ offsets + slope @ offsets + 0.5 * (moved * (metric @ moved)).sum()
+
+    return given, cost
+
+
+def test_offsets_are_the_minimum():
+    given, cost = dented_ball()
+    notes, rng = [], np.random.default_rng(0)
+    found = solve_offsets(*given, notes.append)
+    assert not notes and cost(found) < 0.0 and np.ptp(found) > 0.0
+    for _ in range(20):
+        assert cost(found + 1e-3 * rng.normal(size=len(found))) > cost(found)
+
+
+def test_offsets_that_are_not_solved_say_so(monkeypatch):
+    """Stopped early, they are a step downhill still; such as cannot be solved at all are left out."""
+    given, cost = dented_ball()
+    solved = solve_offsets(*given, lambda text: None)
+    monkeypatch.setattr("shared.solve.shape_step.MOST_ITERATIONS", 3)
+    notes = []
+    early = solve_offsets(*given, notes.append)
+    assert len(notes) == 1 and "only" in notes[0]
+    assert cost(solved) < cost(early) < 0.0
+    notes.clear()
+    refused = solve_offsets(*dented_ball(np.nan)[0], notes.append)
+    assert len(notes) == 1 and "left out" in notes[0]
+    assert not refused.any()
 
 
 def test_irradiance_turns_with_the_normal(toy):

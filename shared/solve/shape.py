@@ -228,7 +228,7 @@ class ShapeSolver:
         metric = large_step_metric(mesh.faces, count, self.settings.smoothness, self.settings.sigma_mm)
         free = np.ones(count, bool)
         free[mesh.faces[held]] = False
-        offsets = solve_offsets(mesh.vertices, start, normals, metric, free, terms)
+        offsets = solve_offsets(mesh.vertices, start, normals, metric, free, terms, self.note)
         largest = LARGEST_STEP_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
         return np.clip(offsets, -largest, largest)
 
