@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shared.geometry import vector_from_rotation
+from shared.robust import ROBUST_SCALE
 
 LEAST_FRAMES = 8
 JERK_DEVIATIONS = 3.0
@@ -67,7 +68,7 @@ def motion_prior_of(poses: np.ndarray, time_s: np.ndarray) -> MotionPrior | None
     """
     if len(poses) < LEAST_FRAMES:
         return None
-    spread = 1.4826 * np.abs(MotionPrior(time_s, 1.0, 1.0).acceleration(poses))
+    spread = ROBUST_SCALE * np.abs(MotionPrior(time_s, 1.0, 1.0).acceleration(poses))
     return MotionPrior(
         time_s,
         max(float(np.median(spread[:, :3])), 1e-3),

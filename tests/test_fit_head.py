@@ -8,7 +8,8 @@ from shared.geometry import project, rigid, rotation_from_vector
 from shared.mesh import interpolate
 from shared.raycast import RayScene
 from shared.solve.depth_noise import DepthNoise
-from shared.solve.fit_head import FitWeights, fit_codes, fit_surface, landmarks_on_points, triangulate
+from shared.solve.fit_head import FitWeights, fit_codes, landmarks_on_points, triangulate
+from shared.solve.fit_surface import fit_surface
 
 MODEL = toy_head()
 ROTATION = rotation_from_vector(np.array([0.1, -0.2, 0.05]))

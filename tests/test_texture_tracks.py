@@ -10,6 +10,7 @@ from shapes import grid_plane
 from shared.atlas import BORDER_TEXELS, PlacedFrame, build_atlas, place_frame, sample
 from shared.geometry import project, rigid, rotation_from_vector
 from shared.raycast import RayScene, camera_hits
+from shared.robust import ROBUST_SCALE
 from shared.texture_tracks import LEAST_SPREAD, MeanTexture, Windows, mean_texture, track_frame
 
 LENS = np.array([[900.0, 0, 120], [0, 900.0, 120], [0, 0, 1]])
@@ -196,7 +197,7 @@ def test_whitened_error_has_unit_spread_under_independent_noise(atlas, noise):
     found, whitening = track_frame(atlas, texture, picture, placed_at(atlas, true), replace(WINDOWS, floor_px=0.0))
     error = found - project(atlas.points(PLANE.vertices), true, LENS)[0]
     whitened = np.einsum("nij,nj->ni", whitening, error)
-    assert 0.6 < 1.4826 * np.nanmedian(np.abs(whitened)) < 1.6
+    assert 0.6 < ROBUST_SCALE * np.nanmedian(np.abs(whitened)) < 1.6
 
 
 def test_glints_that_the_mean_does_not_show_hardly_pull(atlas, texture):

@@ -17,10 +17,11 @@ from scipy.spatial import cKDTree
 from shared.bundle import BundleSolution
 from shared.geometry import camera_centres, projection_slope
 from shared.mesh import normalised
+from shared.robust import ROBUST_SCALE
 
 PATCH_MM = 10.0
 """Radius of the patches: tracks farther apart share no errors."""
-ROBUST_SCALE, CLIP = 1.4826, 3.0
+CLIP = 3.0
 CAUCHY = 2.5
 LEAST_INFORMATION = 1e-6
 

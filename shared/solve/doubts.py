@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 
 from shared.color import LUMINANCE
 from shared.mesh import Mesh, normalised
+from shared.robust import ROBUST_SCALE
 from shared.solve.appearance import AppearanceSolver
 from shared.solve.ladder_gloss import segments_at
 from shared.solve.scale import scale_prior
@@ -29,7 +30,7 @@ WANDERING_GAIN, WANDERING_TINT = 0.03, 0.04
 """Clips with everything locked have 0.003 to 0.006 and 0.003 to 0.011, one under a single hard lamp 0.017 and 0.032."""
 ORIENTED_ALBEDO, UNLIKELY_COLOUR = 0.3, 3.0
 """Good clips have 0.03 to 0.26 and 0.5 to 1.4; a third of the light moving along gives 0.3 to 0.5."""
-BIWEIGHT_REACH, ROBUST_ROUNDS, SKIN_SPREAD = 4.685 * 1.4826, 12, (0.02, 0.1)
+BIWEIGHT_REACH, ROBUST_ROUNDS, SKIN_SPREAD = 4.685 * ROBUST_SCALE, 12, (0.02, 0.1)
 """Of the logarithm of a person's skin: median deviations that are possible; more is hair, or light in the albedo."""
 COVERED, FAR_WORSE = 0.35, 3.0
 """Share of a region's points, and how many times worse than the face's median they fit: 0 to 0.1 without anything

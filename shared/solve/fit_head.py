@@ -1,11 +1,10 @@
-"""The head model fitted to tracked points and landmarks: similarity, identity, expression, then a free correction.
+"""The head model fitted to tracked points and landmarks: similarity, identity, expression.
 
 Track points carry no names: each pulls its nearest place on the surface along the normal. Landmarks carry names but
-slide over the skin, so they steer the lids, lips and brows and weigh little. The free correction bends the surface to
-the track points as a thin plate (bi-Laplacian), so that it stays the model's where no track is.
+slide over the skin, so they steer the lids, lips and brows and weigh little. What the codes leave is for the free
+correction, see shared.solve.fit_surface.
 
-References: Chen and Medioni, Object modelling by registration of multiple range images, 1992 (point to plane); Botsch
-and Sorkine, On linear variational surface deformation methods, TVCG 2008.
+Reference: Chen and Medioni, Object modelling by registration of multiple range images, 1992 (point to plane).
 """
 
 from __future__ import annotations
@@ -13,15 +12,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.sparse as sparse
 from scipy.optimize import lsq_linear
-from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from shared.geometry import project, rotation_from_vector, similarity_from_points
 from shared.head_model import HeadModel
-from shared.mesh import interpolate, uniform_laplacian, vertex_normals
-from shared.raycast import RayScene
+from shared.mesh import interpolate, vertex_normals
 from shared.solve.depth_noise import DepthNoise
 
 
@@ -52,10 +48,6 @@ class HeadFit:
 
 
 EFFECTIVE_TRACKS = 100.0
-SURFACE_REACH_MM = 8.0
-LEAST_RELIEF_MM = 0.3
-"""No head is closer to the model than this."""
-CONTACT_MM, CONTACT_WEIGHT, FACING_COSINE = 2.5, 1.0, -0.5
 APERTURES = np.array(
     [(160, 144), (159, 145), (158, 153), (387, 373), (386, 374), (385, 380), (82, 87), (13, 14), (312, 317)]
 )
@@ -102,7 +94,7 @@ def fit_codes(
         landmarks[known], named[known], weights=model.landmark_weight[known]
     )
     fit = HeadFit(scale, rotation, translation, identity, expression, vertices)
-    usable = _fit_vertices(model)
+    usable = pullable_vertices(model)
     for step in range(iterations):
         reach = 15.0 if step < 4 else 6.0
         fit = _code_step(model, fit, points, landmarks, known, weights, usable, reach)
@@ -113,7 +105,7 @@ def _code_step(model, fit, points, landmarks, known, weights, usable, reach_mm) 
     """One linearised step of similarity and codes; the codes are solved whole, the similarity as an increment."""
     in_head, normals = fit.to_head(points), vertex_normals(fit.vertices, model.faces)
     near, offset, weight = _closest(fit.vertices, normals, usable, in_head, reach_mm)
-    basis = np.concatenate([model.identity_basis, model.expression_basis])
+    bases = model.identity_basis, model.expression_basis
     neutral = model.template
     n = normals[near]
     root = np.sqrt(weight * EFFECTIVE_TRACKS / len(points))[:, None] / weights.track_mm
@@ -121,13 +113,13 @@ def _code_step(model, fit, points, landmarks, known, weights, usable, reach_mm) 
     centre = in_head.mean(0)
     arm = in_head - centre
     moving = np.concatenate([np.cross(arm, n), n, (arm * n).sum(1, keepdims=True)], axis=1)
-    shape_rows = np.einsum("kni,ni->nk", basis[:, near], n)
+    shape_rows = np.einsum("kni,ni->nk", np.concatenate([basis[:, near] for basis in bases]), n)
     rows = [root * np.concatenate([-moving, shape_rows], axis=1)]
     rhs = [root[:, 0] * ((in_head - neutral[near]) * n).sum(1)]
 
     named = fit.to_head(landmarks[known])
     arm = named - centre
-    at = _landmark_basis(model, basis, known)
+    at = np.concatenate([_landmark_basis(model, basis, known) for basis in bases])
     base = interpolate(neutral, model.faces, model.landmark_face[known], model.landmark_bary[known])
     gain = np.sqrt(model.landmark_weight[known]) / weights.landmark_mm
     for axis, unit in enumerate(np.eye(3)):
@@ -137,7 +129,7 @@ def _code_step(model, fit, points, landmarks, known, weights, usable, reach_mm) 
     opening, opening_rhs = _aperture_rows(model, fit, landmarks, weights.aperture_mm)
     rows.append(opening)
     rhs.append(opening_rhs)
-    codes = len(basis)
+    codes = sum(map(len, bases))
     deviation = np.r_[
         np.full(len(model.identity_basis), weights.identity), np.full(len(model.expression_basis), weights.expression)
     ]
@@ -183,7 +175,7 @@ def _landmark_basis(model: HeadModel, basis: np.ndarray, known: np.ndarray) -> n
     return np.einsum("klci,lc->kli", basis[:, corners], model.landmark_bary[known])
 
 
-def _fit_vertices(model: HeadModel) -> np.ndarray:
+def pullable_vertices(model: HeadModel) -> np.ndarray:
     """Indices of vertices that tracks may pull: skin, not eyeballs, inner mouth or scalp."""
     held = ("eyes", "eye_sockets", "inner_mouth", "scalp")
     unpulled = [i for i, name in enumerate(model.segment_names) if name in held]
@@ -198,79 +190,6 @@ def _closest(vertices, normals, usable, points, reach_mm):
     offset = ((points - vertices[near]) * normals[near]).sum(1)
     spread = 3.0 * np.median(np.abs(offset)) + 0.05
     return near, offset, (distance < reach_mm) / (1.0 + (offset / spread) ** 2)
-
-
-def fit_surface(
-    model: HeadModel, fit: HeadFit, points: np.ndarray, noise: DepthNoise, weights: FitWeights, iterations: int = 5
-) -> HeadFit:
-    """The free correction: vertices move by a thin plate through the track points [N, 3] (track space).
-
-    Each point pulls the place on the surface that lies under it along the normal, not the nearest vertex: between
-    vertices a curved surface sags. The plate is as stiff as a Wiener filter wants it: by the power of the points'
-    noise over that of what the codes have left. Lips that the codes have closed stay closed, thin walls thin.
-    """
-    count = len(fit.vertices)
-    laplacian = uniform_laplacian(model.faces, count)
-    plate = (laplacian.T @ laplacian).tocsr() + 1e-4 * sparse.identity(count)
-    contact = CONTACT_WEIGHT * _contact(model, fit.vertices)
-    in_head, vertices = fit.to_head(points), fit.vertices
-    variance = float(np.median(fit.scale * noise.sigma)) ** 2
-    final = weights.stiffness * variance / _relief(model, vertices, in_head, fit.scale * noise.single)
-    for step in range(iterations):
-        stiffness = final * 4.0 ** (iterations - 1 - step)
-        under = _under(model, vertices, in_head, SURFACE_REACH_MM)
-        interpolation = sparse.csr_matrix(
-            (under.bary.ravel(), (np.repeat(np.arange(len(under.bary)), 3), model.faces[under.face].ravel())),
-            shape=(len(under.bary), count),
-        )
-        wanted = interpolation @ (vertices - fit.vertices) + under.offset[:, None] * under.normal
-        weighted = sparse.diags(under.weight) @ interpolation
-        matrix = interpolation.T @ weighted + stiffness * plate + contact
-        factor = splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        vertices = fit.vertices + factor.solve(weighted.T @ wanted)
-    return HeadFit(fit.scale, fit.rotation, fit.translation, fit.identity, fit.expression, vertices)
-
-
-def _relief(model: HeadModel, vertices: np.ndarray, points: np.ndarray, noise_mm: float) -> float:
-    """Mean square of how far the head lies from the surface, mm^2: the points' heights [N, 3] less their noise."""
-    height = 1.4826 * np.median(np.abs(_under(model, vertices, points, SURFACE_REACH_MM).offset))
-    return max(float(height**2 - noise_mm**2), LEAST_RELIEF_MM**2)
-
-
-def _contact(model: HeadModel, vertices: np.ndarray) -> sparse.csr_matrix:
-    """Laplacian [V, V] of the graph that joins vertices closer than CONTACT_MM that face each other or away from each
-    other: lips, and thin walls such as lids before their sockets."""
-    normals = vertex_normals(vertices, model.faces)
-    pairs = cKDTree(vertices).query_pairs(CONTACT_MM, output_type="ndarray")
-    pairs = pairs[(normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(1) < FACING_COSINE]
-    rows = np.repeat(np.arange(len(pairs)), 2)
-    joined = sparse.csr_matrix((np.tile([1.0, -1.0], len(pairs)), (rows, pairs.ravel())), (len(pairs), len(vertices)))
-    return joined.T @ joined
-
-
-@dataclass(frozen=True)
-class _Under:
-    """Places under points along the normal: face [n], bary [n, 3], offset [n] mm, normal [n, 3], Cauchy weight [n]."""
-
-    face: np.ndarray
-    bary: np.ndarray
-    offset: np.ndarray
-    normal: np.ndarray
-    weight: np.ndarray
-
-
-def _under(model: HeadModel, vertices: np.ndarray, points: np.ndarray, reach_mm: float) -> _Under:
-    normals, usable = vertex_normals(vertices, model.faces), _fit_vertices(model)
-    _, nearest = cKDTree(vertices[usable]).query(points)
-    along = normals[usable[nearest]]
-    face, bary, distance = RayScene(vertices, model.faces).intersect(points + reach_mm * along, -along)
-    offset = distance - reach_mm  # of the point above the surface
-    hit = (face >= 0) & (np.abs(offset) < reach_mm)
-    hit[hit] &= (interpolate(normals, model.faces, face[hit], bary[hit]) * along[hit]).sum(1) > 0.5
-    spread = 3.0 * np.median(np.abs(offset[hit])) + 0.05
-    offset = offset[hit].astype(np.float64)
-    weight = 1.0 / (1.0 + (offset / spread) ** 2)
-    return _Under(face[hit], bary[hit].astype(np.float64), offset, along[hit], weight)
 
 
 def landmarks_on_points(

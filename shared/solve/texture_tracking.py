@@ -15,6 +15,7 @@ from shared.bundle_problem import Tracks
 from shared.head_model import HeadModel
 from shared.mesh import Mesh, vertex_normals
 from shared.raycast import RayScene
+from shared.robust import ROBUST_SCALE
 from shared.solve.first_poses import (
     LOSS,
     Adjusted,
@@ -158,9 +159,9 @@ def solve_texture(
     for _ in range(2):
         solved = adjust_clip(clip, tracks.subset(reliable), poses[reliable], points, prior_mm)
         whitened = np.einsum("fnij,fnj->fni", tracks.whitening[reliable], solved.residuals_px)
-        of_track = 1.4826 * np.nanmedian(np.abs(whitened), axis=(0, 2))
+        of_track = ROBUST_SCALE * np.nanmedian(np.abs(whitened), axis=(0, 2))
         of_frame = np.ones(len(reliable))
-        of_frame[reliable] = 1.4826 * np.nanmedian(np.abs(whitened), axis=(1, 2))
+        of_frame[reliable] = ROBUST_SCALE * np.nanmedian(np.abs(whitened), axis=(1, 2))
         worse = np.maximum(of_frame / np.median(of_frame[reliable]), 1.0)
         noise = np.maximum(of_track, 0.3) * worse[:, None]
         tracks = Tracks(tracks.pixels, tracks.whitening / noise[..., None, None])

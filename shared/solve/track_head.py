@@ -28,7 +28,8 @@ from shared.solve.first_poses import (
     landmark_poses,
     start_from_landmarks,
 )
-from shared.solve.fit_head import FitWeights, HeadFit, fit_codes, fit_surface, landmarks_on_points
+from shared.solve.fit_head import FitWeights, HeadFit, fit_codes, landmarks_on_points
+from shared.solve.fit_surface import fit_surface
 from shared.solve.pose_trust import trust
 from shared.solve.texture_tracking import TexturePass, coarse_pass, solve_texture, track_texture
 from shared.solve.tracked_clip import TrackedClip

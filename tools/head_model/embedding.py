@@ -16,6 +16,7 @@ from shared.head_model import HeadModel, parent_location
 from shared.landmarks import LANDMARK_COUNT, OVAL, FaceNetworks
 from shared.mesh import interpolate, normalised, vertex_normals
 from shared.raycast import RayScene, camera_hits
+from shared.robust import ROBUST_SCALE
 from tools.head_model.topology import EYE_LEFT, EYE_RIGHT, LIP_RINGS, MOUTH, SKIN, HeadTopology, rings_around
 
 RENDER_SIZE = 320
@@ -63,7 +64,7 @@ def embed_landmarks(model: HeadModel, topology: HeadTopology, networks: FaceNetw
             scores.append(score)
     places = np.stack(places)
     middle = np.nanmedian(places, axis=0)
-    spread = 1.4826 * np.nanmedian(np.linalg.norm(places - middle, axis=2), axis=0)
+    spread = ROBUST_SCALE * np.nanmedian(np.linalg.norm(places - middle, axis=2), axis=0)
     middle = _symmetric(middle)
     face, bary = _closest(fine, np.repeat(topology.part == SKIN, 16), middle)
     for _ in range(2):
