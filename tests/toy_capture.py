@@ -19,6 +19,7 @@ from shared.transfer import bounce_nodes, irradiance, mesh_points, node_radiosit
 
 FRAMES, ROUGHNESS, SPECULAR, NOISE = 14, 0.4, 0.7, 0.002
 DIRECTIONS = fibonacci_sphere(256)
+MATTE = Settings(resolutions=(6,), steps=4, specular=False, noise=(0.003, 0.01))
 
 
 def true_light(directions):
@@ -103,6 +104,15 @@ def make_truth(
     index = np.nonzero(seen)[0]
     parts = {"points": points.take(index), "samples": samples.points(index), "transfer": transfer.take(index)}
     return replace(capture, **parts, skin=skin[index]), albedo[index], light[index]
+
+
+def solver_of(capture, settings=MATTE):
+    """A solver one step into the fit."""
+    solver = AppearanceSolver(capture, settings)
+    solver.bake()
+    if settings.specular:
+        solver.bake_lobes()
+    return solver
 
 
 def solver_under_true_light(capture):
