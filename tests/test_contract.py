@@ -8,26 +8,11 @@ import sys
 import zlib
 
 import pytest
-from toy_runs import REPOSITORY, make_subject, tree
+from toy_runs import READ_TEXT, REPOSITORY, make_subject, tree
 
-from shared.contract import Output, Parameter, Stage, main
+from shared.contract import Output, Stage, main
 from shared.contract.shapes import describe
 from shared.errors import InputError, LimnError
-
-STAGE = Stage(
-    name="read_text",
-    version=1,
-    help="Reads.",
-    inputs=(),
-    outputs=(Output("text.txt", "the text", unit="mm", space="uv"), Output("lines/%03d.txt", "lines", optional=True),
-             Output("when.json", "times", volatile=True, optional=True)),
-    parameters=(
-        Parameter("size", int, 10, "Size.", "texels", 1, 100),
-        Parameter("letters", str, "lower", "Letters.", choices=("lower", "upper")),
-        Parameter("limit", float, None, "Limit.", "mm", 0.0),
-        Parameter("fast", bool, False, "Speed."),
-    ),
-)
 
 
 def write_text(job):
@@ -47,7 +32,7 @@ def call(tmp_path, pipeline):
     """call(run, *arguments) -> exit code of the stage on the subject `anna`."""
     subject = make_subject(tmp_path / "anna")
 
-    def run_stage(run=write_text, *arguments, check=None, stage=STAGE, folder=subject):
+    def run_stage(run=write_text, *arguments, check=None, stage=READ_TEXT, folder=subject):
         return main(stage, run, check, ["--subject", str(folder), "--pipeline", str(pipeline), *map(str, arguments)])
 
     return run_stage

@@ -1,7 +1,7 @@
 """What is declared and read: values of parameters, stage files, pipeline.yaml, subject.yaml."""
 
 import pytest
-from toy_runs import copy_pipeline, make_subject
+from toy_runs import READ_TEXT, copy_pipeline, make_subject
 
 from shared.contract import Output, Parameter, Stage, load_subject
 from shared.contract.chart_place import AUTO
@@ -13,27 +13,12 @@ from shared.contract.pipeline import load_pipeline, split_settings
 from shared.contract.source import fingerprint, read_declaration
 from shared.errors import InputError, LimnError
 
-STAGE = Stage(
-    name="read_text",
-    version=1,
-    help="Reads.",
-    inputs=(),
-    outputs=(Output("text.txt", "the text", unit="mm", space="uv"), Output("lines/%03d.txt", "lines", optional=True),
-             Output("when.json", "times", volatile=True, optional=True)),
-    parameters=(
-        Parameter("size", int, 10, "Size.", "texels", 1, 100),
-        Parameter("letters", str, "lower", "Letters.", choices=("lower", "upper")),
-        Parameter("limit", float, None, "Limit.", "mm", 0.0),
-        Parameter("fast", bool, False, "Speed."),
-    ),
-)
-
 
 @pytest.mark.parametrize("name, value, parsed", [
     ("size", "20", 20), ("size", 20.0, 20), ("size", "2e1", 20), ("limit", "1e-3", 1e-3), ("limit", 2, 2.0),
     ("limit", "none", None), ("limit", None, None), ("fast", "yes", True), ("fast", False, False), ("seed", "7", 7)])
 def test_values_are_typed(name, value, parsed):
-    result = STAGE.parse({name: value}, "here")[name]
+    result = READ_TEXT.parse({name: value}, "here")[name]
     assert result == parsed and type(result) is type(parsed)
 
 
@@ -44,7 +29,7 @@ def test_values_are_typed(name, value, parsed):
     ("sise", 1, "read_text.size?"), ("seed", -1, "0 .. ")])
 def test_bad_values_say_what_is_allowed(name, value, hint):
     with pytest.raises(InputError, match=name) as error:
-        STAGE.parse({name: value}, "here")
+        READ_TEXT.parse({name: value}, "here")
     assert hint in str(error.value) and "\n" not in str(error.value)
 
 
@@ -54,8 +39,8 @@ def test_bad_default_is_refused():
 
 
 def test_table_lists_every_parameter():
-    rows = parameter_table([STAGE]).splitlines()
-    assert len(rows) == 2 + len(STAGE.parameters)
+    rows = parameter_table([READ_TEXT]).splitlines()
+    assert len(rows) == 2 + len(READ_TEXT.parameters)
     assert "| read_text | `size` | `10` | 1 .. 100 | texels | Size. |" in rows
 
 

@@ -6,12 +6,27 @@ import subprocess
 import sys
 from pathlib import Path
 
+from shared.contract import Output, Parameter, Stage
 from shared.contract.confine import trust
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 TOY = Path(__file__).with_name("toy_pipeline")
 TEXT = "A rose is a rose\nis a rose\n"
 CURRENT_STAGES = ("read_text", "count_words", "draw_bars", "export_page")
+READ_TEXT = Stage(
+    name="read_text",
+    version=1,
+    help="Reads.",
+    inputs=(),
+    outputs=(Output("text.txt", "the text", unit="mm", space="uv"), Output("lines/%03d.txt", "lines", optional=True),
+             Output("when.json", "times", volatile=True, optional=True)),
+    parameters=(
+        Parameter("size", int, 10, "Size.", "texels", 1, 100),
+        Parameter("letters", str, "lower", "Letters.", choices=("lower", "upper")),
+        Parameter("limit", float, None, "Limit.", "mm", 0.0),
+        Parameter("fast", bool, False, "Speed."),
+    ),
+)
 
 
 def copy_pipeline(folder):
