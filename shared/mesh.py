@@ -34,7 +34,8 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def normalised(vectors: np.ndarray) -> np.ndarray:
     """[..., 3] -> unit length; the zero vector stays zero."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-20)
+    x, y, z = np.moveaxis(vectors, -1, 0)  # a sum over so short an axis takes numpy ten times as long
+    return vectors / np.maximum(np.sqrt(x * x + y * y + z * z), 1e-20)[..., None]
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -42,13 +43,12 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     corners = vertices[faces]
     normals = normalised(face_normals(vertices, faces))
     total = np.zeros_like(vertices, dtype=np.float64)
+    to_next = [normalised(corners[:, (k + 1) % 3] - corners[:, k]) for k in range(3)]
     for k in range(3):
-        to_next = normalised(corners[:, (k + 1) % 3] - corners[:, k])
-        to_last = normalised(corners[:, (k + 2) % 3] - corners[:, k])
-        angle = np.arccos(np.clip((to_next * to_last).sum(1), -1.0, 1.0))
-        weighted = normals * angle[:, None]
+        x, y, z = (to_next[k] * -to_next[k - 1]).T
+        angle = np.arccos(np.clip(x + y + z, -1.0, 1.0))
         for axis in range(3):
-            total[:, axis] += np.bincount(faces[:, k], weighted[:, axis], len(vertices))
+            total[:, axis] += np.bincount(faces[:, k], normals[:, axis] * angle, len(vertices))
     return normalised(total)
 
 
