@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -20,6 +22,19 @@ BACKDROP, INK = 34, (225, 225, 225)
 SAMPLES = 2
 
 
+@dataclass(frozen=True)
+class _Shape:
+    """A mesh with its vertex normals [V, 3], ready for rays."""
+
+    mesh: Mesh
+    normals: np.ndarray
+    scene: RayScene
+
+    @staticmethod
+    def of(mesh: Mesh) -> _Shape:
+        return _Shape(mesh, vertex_normals(mesh.vertices, mesh.faces), RayScene(mesh.vertices, mesh.faces))
+
+
 def shape_sheet(start: Mesh, mesh: Mesh, face: np.ndarray | None, size: int = 400) -> np.ndarray:
     """uint8 [4 size, 3 size, 3]: rows start, mesh, its normals, difference; front, three-quarter and side.
 
@@ -28,9 +43,9 @@ def shape_sheet(start: Mesh, mesh: Mesh, face: np.ndarray | None, size: int = 40
     inside = mesh.vertices if face is None else mesh.vertices[np.unique(mesh.faces[face])]
     low, high = inside.min(0), inside.max(0)
     centre, extent = 0.5 * (low + high), 1.25 * float((high - low)[1])
-    normals = vertex_normals(start.vertices, start.faces)
-    raised = ((mesh.vertices - start.vertices) * normals).sum(1)
-    columns = [_views(start, mesh, raised, np.radians(yaw), centre, extent, size) for yaw in YAWS_DEG]
+    before = _Shape.of(start)
+    after = before if np.array_equal(start.vertices, mesh.vertices) else _Shape.of(mesh)
+    columns = [_views(before, after, np.radians(yaw), centre, extent, size) for yaw in YAWS_DEG]
     sheet = np.concatenate(columns, axis=1)
     names = ("start", "refined", "normals", f"refined - start: red {LARGEST_DIFFERENCE_MM:g} mm out, blue in")
     for row, name in enumerate(names):
@@ -40,33 +55,34 @@ def shape_sheet(start: Mesh, mesh: Mesh, face: np.ndarray | None, size: int = 40
     return sheet
 
 
-def _views(start, mesh, raised, yaw, centre, extent, size) -> np.ndarray:
+def _views(before: _Shape, after: _Shape, yaw, centre, extent, size) -> np.ndarray:
     """The four pictures of one direction, [4 size, size, 3]."""
     turn = WORLD_FROM_CAMERA @ rotation_from_vector(np.array([0.0, yaw, 0.0]))
     pose = rigid(turn, -turn @ centre + [0.0, 0.0, DISTANCE * extent])
     lens = np.array([[DISTANCE * size, 0.0, size / 2], [0.0, DISTANCE * size, size / 2], [0.0, 0.0, 1.0]])
     to_picture = turn.T @ WORLD_FROM_CAMERA
-    before, after = (vertex_normals(shown.vertices, shown.faces) @ to_picture for shown in (start, mesh))
+    raised = ((after.mesh.vertices - before.mesh.vertices) * before.normals).sum(1)
     share = np.clip(raised / LARGEST_DIFFERENCE_MM, -1.0, 1.0)[:, None]
     difference = 1.0 - np.maximum(share, 0.0) * [0.0, 1.0, 1.0] + np.minimum(share, 0.0) * [1.0, 1.0, 0.0]
-    pictures = [_drawn(start, _shade(before), pose, lens, size)]
-    values = np.concatenate([_shade(after), 0.5 * after + 0.5, difference], axis=1)
-    pictures.append(_drawn(mesh, values, pose, lens, size))
-    return np.concatenate([pictures[0], *np.split(pictures[1], 3, axis=2)])
+    normals = after.normals @ to_picture
+    values = np.concatenate([_shade(normals), 0.5 * normals + 0.5, difference], axis=1)
+    refined = np.split(_drawn(after, values, pose, lens, size), 3, axis=2)
+    first = refined[0] if after is before else _drawn(before, _shade(before.normals @ to_picture), pose, lens, size)
+    return np.concatenate([first, *refined])
 
 
 def _shade(normals: np.ndarray) -> np.ndarray:
     return np.repeat(0.1 + 0.85 * np.maximum(normals @ LAMP, 0.0)[:, None], 3, axis=1)
 
 
-def _drawn(mesh: Mesh, values: np.ndarray, pose: np.ndarray, lens: np.ndarray, size: int) -> np.ndarray:
+def _drawn(shape: _Shape, values: np.ndarray, pose: np.ndarray, lens: np.ndarray, size: int) -> np.ndarray:
     """Vertex values [V, C] in 0 .. 1 as the camera sees them, uint8 [size, size, C]."""
-    scene, total = RayScene(mesh.vertices, mesh.faces), 0.0
+    total = 0.0
     for offset in np.ndindex(SAMPLES, SAMPLES):
         offsets = tuple((np.array(offset) + 0.5) / SAMPLES)
-        face, bary, _ = camera_hits(scene, pose, lens, size, size, offsets)
+        face, bary, _ = camera_hits(shape.scene, pose, lens, size, size, offsets)
         picture = np.full((size, size, values.shape[1]), BACKDROP / 255.0)
         hit = face >= 0
-        picture[hit] = interpolate(values, mesh.faces, face[hit], bary[hit])
+        picture[hit] = interpolate(values, shape.mesh.faces, face[hit], bary[hit])
         total = total + picture / SAMPLES**2
     return np.clip(np.round(total * 255.0), 0, 255).astype(np.uint8)

@@ -29,3 +29,9 @@ def test_sheet_shows_both_meshes_normals_and_where_they_differ():
     assert (last[middle + 20, middle] == [0, 0, 255]).all()
     assert (last[middle, middle] == 255).all()
     assert (sheet[SIZE - 2, 2] == BACKDROP).all()
+
+
+def test_a_mesh_that_has_not_moved_is_drawn_once_and_looks_the_same():
+    start = sphere(100.0, 4)
+    hardly = start.replace(vertices=start.vertices * (1.0 + 1e-12))
+    np.testing.assert_array_equal(shape_sheet(start, start, None, SIZE), shape_sheet(start, hardly, None, SIZE))
