@@ -39,13 +39,14 @@ def average_frames(job: Job, inputs, surface, viewer) -> tuple:
     """Weighted mean radiance [T, 3] and total weight [T] of the texels over the chosen frames."""
     import numpy as np
 
+    from shared.read_ahead import read_ahead
     from shared.solve.capture import spread_frames
 
     total, weight = np.zeros((len(surface), 3), np.float32), np.zeros(len(surface), np.float32)
     chosen = spread_frames(len(inputs.camera_from_head), job.params.frames)
-    for f in job.progress(chosen, "projecting frames", total=len(chosen)):
-        picture, pose = inputs.picture(f), inputs.camera_from_head[f]
-        view = viewer.view(pose, inputs.intrinsics, inputs.size)
+    pictures = read_ahead(map(inputs.picture, job.progress(chosen, "projecting frames", total=len(chosen))))
+    for f, picture in zip(chosen, pictures, strict=True):
+        view = viewer.view(inputs.camera_from_head[f], inputs.intrinsics, inputs.size)
         samples, _ = surface.samples(view, picture, inputs.intrinsics)
         total[samples.rows] += samples.weight[:, None] * samples.colours
         weight[samples.rows] += samples.weight

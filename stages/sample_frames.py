@@ -122,7 +122,7 @@ def write_frames(reader, selection, networks, chart, job: Job) -> tuple[list[dic
     from shared.framing import face_height
     from shared.io.images import write_png
     from shared.picture_detail import ClipDetail
-    from shared.read_ahead import read_ahead
+    from shared.read_ahead import read_ahead, write_behind
 
     for folder in ("frames", "masks"):
         (job.out / folder).mkdir(parents=True, exist_ok=True)
@@ -136,18 +136,22 @@ def write_frames(reader, selection, networks, chart, job: Job) -> tuple[list[dic
         codes = area_average(part, crop.size, transfer)
         return frame, whole, codes, display_codes(codes, transfer)
 
+    def save(record, codes, mask):
+        write_png(job.out / record["file"], codes)
+        write_png(job.out / record["mask"], mask)
+
     frames = read_ahead(map(cut_out, reader.frames(selection.frame_index)))
-    for i, (frame, whole, codes, rgb) in enumerate(job.progress(frames, "cropping", total=count)):
-        chart.look(i, frame.index, whole)
-        points = (selection.landmarks[i][:, :2] - (crop.x0, crop.y0)) * crop.scale
-        mask = frame_mask(rgb, networks.person_mask(rgb), points)
-        records.append(frame_record(frame.index, frame.time_s, points, selection.sharpness[i]))
-        write_png(job.out / records[-1]["file"], codes)
-        write_png(job.out / records[-1]["mask"], mask)
-        clipped.append(clipped_share(codes, mask))
-        grey.append(is_grey(codes))
-        detail.look(i, rgb, mask == FACE, face_height(points))
-        sheet.add(rgb, mask)
+    with write_behind() as write:
+        for i, (frame, whole, codes, rgb) in enumerate(job.progress(frames, "cropping", total=count)):
+            chart.look(i, frame.index, whole)
+            points = (selection.landmarks[i][:, :2] - (crop.x0, crop.y0)) * crop.scale
+            mask = frame_mask(rgb, networks.person_mask(rgb), points)
+            records.append(frame_record(frame.index, frame.time_s, points, selection.sharpness[i]))
+            write(save, records[-1], codes, mask)
+            clipped.append(clipped_share(codes, mask))
+            grey.append(is_grey(codes))
+            detail.look(i, rgb, mask == FACE, face_height(points))
+            sheet.add(rgb, mask)
     write_png(job.out / "contact_sheet.png", sheet.picture())
     if chart.picture is not None:
         write_png(job.out / "chart.png", chart.picture)
