@@ -217,7 +217,7 @@ def _for_each_plan(args: argparse.Namespace, show) -> int:
     parameters = all_parameters(pipeline, args.preset, args.set)
     opened = open_cases(find_subjects(args.subjects, args.list), args.out)
     for case in opened.cases:
-        show(case, plan_case(pipeline, case, parameters, getattr(args, "verify", False)))
+        show(case, plan_case(pipeline, case, parameters, getattr(args, "verify", False), drift=True))
     opened.all()
     return 0
 

@@ -37,12 +37,15 @@ class StagePlan:
 
 
 def plan_case(pipeline: Pipeline, case: Case, parameters: Mapping[str, Mapping[str, object]],
-              verify: bool = False) -> dict[str, StagePlan]:
-    """{label of the stage: plan} in the pipeline's order. verify: read every published file again."""
+              verify: bool = False, drift: bool = False) -> dict[str, StagePlan]:
+    """{label of the stage: plan} in the pipeline's order. verify: read every published file again; drift: remark where
+    the code is another one than that which ran, for people: it takes a second to find out."""
     memory = HashMemory(case.run.memory, verify)
     plans: dict[str, StagePlan] = {}
     for part, name in case.jobs(pipeline):
         plan = _plan_stage(pipeline.stages[name], part, parameters[name], plans, memory)
+        if drift and plan.state == CURRENT:
+            plan = replace(plan, reasons=_drift(part, name))
         plans[part.label(name)] = replace(plan, case=part)
     memory.save()
     return plans
@@ -64,12 +67,12 @@ def _plan_stage(stage: Stage, case: Case, parameters: Mapping[str, object], plan
     waiting = [label for label in needed.values() if plans[label].state != CURRENT]
     if waiting:
         return StagePlan(stage.name, WAITS, (f"if the outputs of {', '.join(waiting)} change",))
-    return StagePlan(stage.name, CURRENT, _drift(case, stage), outputs_digest(manifest))
+    return StagePlan(stage.name, CURRENT, (), outputs_digest(manifest))
 
 
-def _drift(case: Case, stage: Stage) -> tuple[str, ...]:
+def _drift(case: Case, stage: str) -> tuple[str, ...]:
     """A remark where code has changed since the stage ran although its version has not."""
-    provenance = read_record(case.run.published(stage.name) / PROVENANCE) or {}
+    provenance = read_record(case.run.published(stage) / PROVENANCE) or {}
     recorded = provenance.get("code", {})
     changed = [name for name, was in recorded.items()
                if not (REPOSITORY / name).is_file() or _fingerprint(name) != was]
