@@ -158,7 +158,8 @@ def _start(home: Path, settings: Settings, log: Path) -> subprocess.Popen:
     if settings.profile:
         command += ["--profile", profile_folder(settings.profile)]
     search = [str(REPOSITORY), os.environ.get("PYTHONPATH", "")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, search)), "TMPDIR": str(home / "tmp")}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, search)), "TMPDIR": str(home / "tmp"),
+                                "PYTHONHASHSEED": "0"}  # so that the stages' interpreters need not start anew
     with open(log, "wb") as file:
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
                                 env=environment, cwd=home, start_new_session=True, preexec_fn=_die_with_parent)

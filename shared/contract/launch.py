@@ -1,7 +1,8 @@
 """Starts a stage for the workflow: `python -m shared.contract.launch FOLDER PACKAGE NAME [stage arguments]`.
 
 Ties the process to its parent, so that a stage never outlives a killed workflow; answers at once where the stage's
-result is current, without loading what the stage needs; else becomes `python -m PACKAGE.NAME`.
+result is current, without loading what the stage needs; else goes on as `python -m PACKAGE.NAME`, in a new interpreter
+only where this one orders its sets by chance.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import runpy
 import signal
 import sys
 from pathlib import Path
@@ -48,7 +50,7 @@ def earlier_verdict(events: Path | None) -> int | None:
 
 
 def main() -> int:
-    """0 where the stage is current, 2 where the input is at fault; otherwise it does not return."""
+    """0 where the stage is current, 2 where the input is at fault; otherwise the stage ends the process as a rule."""
     tie_to_parent()
     folder, package, name, *arguments = sys.argv[1:]
     stage = read_declaration(Path(folder).joinpath(*package.split("."), f"{name}.py"))
@@ -66,10 +68,16 @@ def main() -> int:
         report_input_error(name, error, request.events)
         return 2
     set_threads(request.threads)
-    os.environ["PYTHONHASHSEED"] = "0"
-    search = [folder, str(REPOSITORY), os.environ.get("PYTHONPATH", "")]
-    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, search))
-    os.execv(sys.executable, [sys.executable, "-m", f"{package}.{name}", *arguments])
+    search = [folder, str(REPOSITORY)]
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [*search, os.environ.get("PYTHONPATH", "")]))
+    module = f"{package}.{name}"
+    if sys.flags.hash_randomization:
+        os.environ["PYTHONHASHSEED"] = "0"
+        os.execv(sys.executable, [sys.executable, "-m", module, *arguments])
+    sys.path[:0] = search
+    sys.argv[1:] = arguments
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    return 0
 
 
 if __name__ == "__main__":
