@@ -35,3 +35,19 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def truth(one_thread):
+    """The toy capture, its albedo and its irradiance."""
+    from toy_capture import make_truth
+
+    return make_truth()
+
+
+@pytest.fixture(scope="module")
+def matte(one_thread):
+    """The same without highlights."""
+    from toy_capture import make_truth
+
+    return make_truth(specular=0.0)

@@ -27,16 +27,6 @@ from shared.transfer import nearest_points
 GLOSSY = replace(MATTE, specular=True, roughness=ROUGHNESS)
 
 
-@pytest.fixture(scope="module")
-def truth(one_thread):
-    return make_truth()
-
-
-@pytest.fixture(scope="module")
-def matte(one_thread):
-    return make_truth(specular=0.0)
-
-
 def truly_lit(solver, capture):
     """What the solver's forward model gives under the true light and the true node albedo."""
     solver.set_light(("cubemap", 16))

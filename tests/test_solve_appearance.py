@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toy_capture import DIRECTIONS, MATTE, NOISE, make_truth, true_light
+from toy_capture import DIRECTIONS, MATTE, NOISE, true_light
 
 from shared.envmap import cube_directions
 from shared.geometry import fibonacci_sphere
@@ -12,16 +12,6 @@ from shared.mesh import normalised
 from shared.shading import light_along
 from shared.solve.appearance import Settings
 from shared.solve.fit_appearance import SHAPING_STEPS, fit_appearance
-
-
-@pytest.fixture(scope="module")
-def truth(one_thread):
-    return make_truth()
-
-
-@pytest.fixture(scope="module")
-def matte(one_thread):
-    return make_truth(specular=0.0)
 
 
 def scale_free_error(found, true):
