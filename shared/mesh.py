@@ -38,6 +38,13 @@ def normalised(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.sqrt(x * x + y * y + z * z), 1e-20)[..., None]
 
 
+def tangent_frames(normals: np.ndarray) -> np.ndarray:
+    """[P, 3] unit normals -> [P, 2, 3]: two unit tangents at right angles to each other."""
+    axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    first = normalised(np.cross(normals, axis))
+    return np.stack([first, np.cross(normals, first)], axis=1)
+
+
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """[V, 3], [F, 3] -> [V, 3] unit normals, faces weighted by their angle at the vertex."""
     corners = vertices[faces]

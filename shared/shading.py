@@ -10,6 +10,7 @@ depend on the camera and are made for key frames, a few degrees of turn apart.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from scipy.spatial import cKDTree
 from shared.brdf import hemispherical_albedo
 from shared.envmap import frame_lookup
 from shared.geometry import camera_centres, vector_from_rotation, world_from_head
+from shared.irradiance_errors import SHADOW_MM, irradiance_slope, shadow_doubt
 from shared.lobes import LobeTable, specular_reflection
 from shared.mesh import normalised
 from shared.transfer import Points, Transfer, bounced_irradiance, irradiance, node_radiosity
@@ -31,7 +33,6 @@ DEEP = 0.9
 
 LARGEST_SHARE = 0.95
 """Of the light that arrives, what a surface can send on: were it all of it, bounces would not end."""
-_POINTS_PER_BLOCK = 8192
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,7 @@ class VertexShading:
             self._turn += 2.0 * np.pi * light_index
         self._keys = key_frames(self._turn, self._key_step)
         self._key_reflection: dict[int, np.ndarray] = {}
+        self._key_doubt: np.ndarray | None = None
 
     def _sent_by_nodes(self) -> np.ndarray:
         """[K, F * 3]: the nodes' radiosity over pi, with all diffuse bounces."""
@@ -133,13 +135,25 @@ class VertexShading:
 
         Lobes of skin are 20 degrees wide and more: linear interpolation over a turn of three is exact to 1 % of them.
         """
+        return self._between_keys(frame, self._at_key)
+
+    def shadow_doubt(self, frame: int) -> np.ndarray:
+        """[V, 3] float32: standard deviation of E, given how far off the borders of shadows may be."""
+        if self._key_doubt is None:
+            light = self.light_along[:, self._keys].reshape(len(self.directions), -1)
+            doubt = shadow_doubt(self.points, self.transfer, light, self.directions, SHADOW_MM)
+            self._key_doubt = doubt.reshape(len(self.points), len(self._keys), 3).astype(np.float16)
+        return self._between_keys(frame, lambda key: self._key_doubt[:, np.searchsorted(self._keys, key)])
+
+    def _between_keys(self, frame: int, at_key: Callable[[int], np.ndarray]) -> np.ndarray:
+        """[V, 3] float32 of what at_key says [P, 3] of the two key frames around a frame."""
         after = int(np.searchsorted(self._keys, frame))
         high = int(self._keys[after])
         low = high if high == frame else int(self._keys[after - 1])
         share = (self._turn[frame] - self._turn[low]) / max(self._turn[high] - self._turn[low], 1e-12)
-        value = self._at_key(low).astype(np.float32)
+        value = at_key(low).astype(np.float32)
         if high != low:
-            value += np.float32(share) * (self._at_key(high).astype(np.float32) - value)
+            value += np.float32(share) * (at_key(high).astype(np.float32) - value)
         return value[self.stand_in]
 
     def irradiance_of_points(self, rows: np.ndarray) -> np.ndarray:
@@ -174,25 +188,6 @@ class VertexShading:
             )
             self._key_reflection[frame] = value
         return self._key_reflection[frame]
-
-
-def irradiance_slope(
-    transfer: Transfer, normals: np.ndarray, light: np.ndarray, directions: np.ndarray
-) -> np.ndarray:
-    """[P, C] float32: by how much E over pi of points with normals [P, 3] changes per radian that they turn, at most.
-
-    light [J, C]: along directions [J, 3]. E = n . W with the irradiance vector W (Arvo 1994), so it is the length of
-    what of W lies in the surface.
-    """
-    moments = (light[:, :, None] * directions[:, None] * (4.0 / len(directions))).astype(np.float32)
-    slope = np.empty((len(normals), light.shape[1]), np.float32)
-    for start in range(0, len(slope), _POINTS_PER_BLOCK):
-        rows = np.arange(start, min(start + _POINTS_PER_BLOCK, len(slope)))
-        visible, own = transfer.visibility(rows).astype(np.float32), normals[rows]
-        vector = (visible @ moments.reshape(len(light), -1)).reshape(len(rows), -1, 3)
-        along = np.einsum("pcx,px->pc", vector, own)
-        slope[rows] = np.linalg.norm(vector - along[..., None] * own[:, None], axis=2)
-    return slope
 
 
 def _stand_ins(vertices: np.ndarray, index: np.ndarray, blocked: np.ndarray, deep: float) -> np.ndarray:

@@ -10,8 +10,9 @@ Method   What no track reaches (ears, skull, jaw) moves until the mesh's outline
          colours of a room out of the albedo. Under that light the mesh is refined from parallax and shading by
          Gauss-Newton, coarse to fine, the light solved anew, and the refined mesh kept if held-out frames fit better.
          Or (model=auto) the model is chosen first, on few points and frames: shared/solve/ladder.py. Then albedo and
-         specular intensity per texel in closed form, streaming over the frames. The solver starts from a uniform light
-         and the priors: of one clip it needs no start from init_albedo, which is an input for comparison only.
+         specular intensity per texel in closed form, streaming over the frames; samples where a cast shadow ends, which
+         the mesh tells to millimetres only, count less. The solver starts from a uniform light and the priors: of one
+         clip it needs no start from init_albedo, which is an input for comparison only.
          Or (solver=reference) as published: shared/solve/reference.py.
          Several clips of one head under different lights are solved as one (shared/solve/joint_clips.py): one mesh and
          one set of maps, a light and poses of each. What lies at the top is the first clip's then, and clips/ holds
@@ -33,7 +34,7 @@ LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 STAGE = Stage(
     name="inverse_render",
-    version=11,
+    version=12,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),

@@ -11,14 +11,13 @@ from toy_head import toy_head
 from shared.envmap import cube_directions
 from shared.gather import SurfaceViewer, prepare_picture
 from shared.geometry import projection_slope, rigid, rotation_from_vector
-from shared.mesh import Mesh, interpolate, normalised, vertex_normals
+from shared.mesh import Mesh, interpolate, normalised, tangent_frames, vertex_normals
 from shared.raycast import RayScene, camera_hits
 from shared.shading import Material, VertexShading
 from shared.solve.appearance import Settings
 from shared.solve.capture import Sizes, set_scenery
 from shared.solve.shape import Reflectance, ShapeClip, ShapeSettings, ShapeSolver
 from shared.solve.shape_equations import EquationSettings, excess
-from shared.solve.shape_samples import tangent_frames
 from shared.solve.shape_step import TrackPoints, large_step_metric, normal_turns, solve_offsets
 from shared.solve.shape_terms import Reflections, shading_terms
 from shared.transfer import mesh_points

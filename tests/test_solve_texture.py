@@ -206,10 +206,32 @@ class PlateShading:
     def mean_slope(self, frames):
         return np.zeros((len(self.uvs), 3))
 
+    def shadow_doubt(self, frame):
+        return np.zeros((len(self.uvs), 3), np.float32)
+
     def reflection(self, frame):
         centre = 0.5 + 0.4 * np.array([np.cos(1.1 * frame), np.sin(1.1 * frame)])
         spot = 0.3 * np.exp(-((self.uvs - centre) ** 2).sum(1) / 0.08)
         return np.repeat(spot[:, None], 3, axis=1).astype(np.float32)
+
+
+class ShadedPlate(PlateShading):
+    """The plate with a shadow that wanders over it, its border off by shift; doubt: whether that is known."""
+
+    def __init__(self, mesh, shift=0.0, doubt=False):
+        super().__init__(mesh)
+        self.shift, self.doubt = shift, doubt
+
+    def open_share(self, frame, shift):
+        border = 0.15 + 0.02 * frame + shift
+        return (0.05 + 0.95 * np.clip((self.uvs[:, :1] - border) / 0.06 + 0.5, 0.0, 1.0)).astype(np.float32)
+
+    def irradiance(self, frame):
+        return super().irradiance(frame) * self.open_share(frame, self.shift)
+
+    def shadow_doubt(self, frame):
+        spread = self.open_share(frame, self.shift + 0.05) - self.open_share(frame, self.shift - 0.05)
+        return self.doubt * np.abs(spread) * super().irradiance(frame)
 
 
 def true_albedo(uv):
@@ -295,6 +317,25 @@ def test_more_frames_mean_more_confidence():
         found.append(make_maps(surface, material, 0.4)["confidence"].ravel()[surface.pixel])
     seen = texel_uv(surface)[:, 0] < 0.7
     assert (found[1][seen] > found[0][seen]).all()
+
+
+def test_borders_of_shadows_that_lie_elsewhere_spoil_little():
+    """Samples near a border that may lie elsewhere count less, and texels that have no others are trusted less."""
+    mesh, found = grid_plane(33, 80.0), []
+    surface, viewer, clip = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh), plate_clip(mesh, ShadedPlate(mesh))
+    for doubt in (False, True):
+        shading = ShadedPlate(mesh, 0.04, doubt)
+        material, _ = TexturePass(surface, viewer, shading, clip, SPECULAR, np.array([0.5, 0.4, 0.25])).run((np.inf,))
+        confidence = make_maps(surface, material, 0.4)["confidence"].ravel()[surface.pixel]
+        found.append((np.abs(np.log(material.albedo / true_albedo(texel_uv(surface)))).max(1), confidence))
+    (plain, sure), (doubted, less_sure) = found
+    u = texel_uv(surface)[:, 0]
+    crossed, never = (u > 0.12) & (u < 0.4), (u > 0.5) & (u < 0.7)
+    assert np.mean(doubted[crossed] ** 2) < 0.6 * np.mean(plain[crossed] ** 2)
+    trusted = [np.sqrt(np.mean(error[crossed & (conf > 0.5)] ** 2)) for error, conf in found]
+    assert trusted[1] < 0.3 * trusted[0], "what is still trusted is right"
+    for with_doubt, without in ((doubted, plain), (less_sure, sure)):
+        assert np.allclose(with_doubt[never], without[never], atol=0.01)
 
 
 def test_clipped_frames_do_not_darken_the_albedo():

@@ -14,7 +14,6 @@ import numpy as np
 
 from shared.gather import Picture, SurfaceViewer, remap, sample_inside, sample_limits
 from shared.geometry import project, projection_slope
-from shared.mesh import normalised
 
 LEAST_BLUR_PX = 0.3
 MARGIN_PX = 8
@@ -39,13 +38,6 @@ class SurfaceSamples:
         """The samples of some points."""
         arrays = (self.colours, self.gradient, self.pixels_per_mm, self.weight, self.limits)
         return SurfaceSamples(*(array[index] for array in arrays))
-
-
-def tangent_frames(normals: np.ndarray) -> np.ndarray:
-    """[P, 3] unit normals -> [P, 2, 3]: two unit tangents at right angles to each other."""
-    axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    first = normalised(np.cross(normals, axis))
-    return np.stack([first, np.cross(normals, first)], axis=1)
 
 
 @dataclass(frozen=True)

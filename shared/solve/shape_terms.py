@@ -19,9 +19,8 @@ import torch
 from scipy.spatial import cKDTree
 
 from shared.lobes import specular_reflection
-from shared.mesh import normalised
+from shared.mesh import normalised, tangent_frames
 from shared.shading import VertexShading
-from shared.solve.shape_samples import tangent_frames
 from shared.transfer import Points, position_and_normal, spread_vertices
 
 NORMAL_STEP = 0.06

@@ -37,6 +37,9 @@ NORMAL_ERROR = 0.05
 LEAST_BORDER_MM = 0.5
 """Error of where the head's outline lies, however well its surface is known."""
 
+PRODUCTS = 7
+"""That the normal equations sum up per channel."""
+
 POOL = 1.0
 """Texels of a neighbourhood that count as independent for the specular intensity: errors of shape and light are as
 wide as the neighbourhood itself."""
@@ -67,20 +70,30 @@ class TexelMaterial:
 class NormalEquations:
     """Sums over frames per texel and channel of weighted products of E, S and the colour I.
 
-    sums [T, 18]: EE, ES, EI, SS and SI side by side, then EE of the samples that are neither clipped nor crushed, three
-    channels each, so that a frame is added in one go; clipped_ee [T, 3]: EE of clipped samples, satisfied or not.
+    sums [T, 21]: EE, ES, EI, SS and SI side by side, then EE of the samples that are neither clipped nor crushed, and
+    the variance that borders of shadows give a sample, three channels each, so that a frame is added in one go;
+    clipped_ee [T, 3]: EE of clipped samples, satisfied or not.
     """
 
     def __init__(self, texels: int, noise: Noise):
-        self.noise, self.sums = noise, np.zeros((texels, 18), np.float32)
+        self.noise, self.sums = noise, np.zeros((texels, 3 * PRODUCTS), np.float32)
         self.clipped_ee = np.zeros((texels, 3), np.float32)
-        columns = (self.sums[:, 3 * k : 3 * k + 3] for k in range(6))
-        self.ee, self.es, self.ei, self.ss, self.si, self.measured_ee = columns
+        columns = (self.sums[:, 3 * k : 3 * k + 3] for k in range(PRODUCTS))
+        self.ee, self.es, self.ei, self.ss, self.si, self.measured_ee, self.shadow = columns
 
-    def add(self, samples: TexelSamples, irradiance: np.ndarray, reflection: np.ndarray, robust: np.ndarray) -> None:
-        """irradiance, reflection, robust [n, 3] at samples.rows; robust: extra weight per channel."""
+    def add(
+        self,
+        samples: TexelSamples,
+        irradiance: np.ndarray,
+        reflection: np.ndarray,
+        robust: np.ndarray,
+        shadow: np.ndarray | None = None,
+    ) -> None:
+        """irradiance, reflection, robust, shadow [n, 3] at samples.rows; robust: extra weight per channel; shadow:
+        standard deviation of the modelled radiance, since borders of shadows may lie elsewhere; None: of none."""
+        shadow = np.zeros_like(irradiance) if shadow is None else shadow
         limits, noise = samples.limits, (np.float32(self.noise.absolute), np.float32(self.noise.relative))
-        seen = samples.rows, samples.weight, samples.colours, limits, irradiance, reflection, robust
+        seen = samples.rows, samples.weight, samples.colours, limits, irradiance, reflection, robust, shadow
         _add_samples(*seen, *noise, self.sums, self.clipped_ee)
 
     def solve_albedo(self, specular: np.ndarray, fallback: np.ndarray, pull: float | np.ndarray) -> np.ndarray:
@@ -104,6 +117,11 @@ class NormalEquations:
         albedo = self._bounded_albedo(typical_albedo)
         spared = self.measured_ee / np.maximum(self.measured_ee + self.clipped_ee, 1e-9)
         return 1.0 / (systematic + CORRELATED_FRAMES / np.maximum(spared**2 * self.measured_ee * albedo**2, 1e-9))
+
+    def shadow_variance(self, typical_albedo: np.ndarray) -> np.ndarray:
+        """[T, 3] of the log albedo, since borders of shadows may lie elsewhere: in all frames the same mesh casts
+        them. typical_albedo [3]: what the samples' variance was reckoned with."""
+        return self.shadow / np.maximum(self.ee * np.square(typical_albedo), 1e-9)
 
     def _bounded_albedo(self, typical_albedo: np.ndarray) -> np.ndarray:
         return np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)
@@ -145,7 +163,7 @@ def weigh_lights(
     left = np.zeros_like(information)
     for own, error in zip(parts, systematic, strict=True):
         share = own.trusted_share(typical_albedo, error)
-        whole.sums += own.sums * np.tile(share, 6)
+        whole.sums += own.sums * np.tile(share, PRODUCTS)
         whole.clipped_ee += own.clipped_ee * share
         left += np.square(own.ee * share) * error
     return Evidence(whole, information, left / np.maximum(np.square(whole.ee), 1e-12))
@@ -172,20 +190,21 @@ class BorderSums:
 
 @compiled
 def _add_samples(
-    rows, weight, colours, limits, irradiance, reflection, robust, absolute, relative, sums, clipped_ee
+    rows, weight, colours, limits, irradiance, reflection, robust, shadow, absolute, relative, sums, clipped_ee
 ):
     for i in range(len(rows)):
         row = rows[i]
         for c in range(3):
             colour, e, s = colours[i, c], irradiance[i, c], reflection[i, c]
-            sigma = absolute + relative * colour
-            trust = weight[i] / (sigma * sigma)
+            sigma, border = absolute + relative * colour, shadow[i, c]
+            trust = weight[i] / (sigma * sigma + border * border)
             weighted = trust * robust[i, c]
             sums[row, c] += weighted * e * e
             sums[row, 3 + c] += weighted * e * s
             sums[row, 6 + c] += weighted * e * colour
             sums[row, 9 + c] += weighted * s * s
             sums[row, 12 + c] += weighted * s * colour
+            sums[row, 18 + c] += weighted * border * border
             if limits[i, c] == 0:
                 sums[row, 15 + c] += weighted * e * e
             elif limits[i, c] > 0:
@@ -193,14 +212,21 @@ def _add_samples(
 
 
 def robust_weight(
-    model: np.ndarray, samples: TexelSamples, noise: Noise, information: np.ndarray, scale: float = 2.5
+    model: np.ndarray,
+    samples: TexelSamples,
+    noise: Noise,
+    information: np.ndarray,
+    shadow: np.ndarray | float = 0.0,
+    scale: float = 2.5,
 ) -> np.ndarray:
     """Cauchy weight [n, 3] of each sample given the model [n, 3]; 0 where a clipped or crushed sample is satisfied.
 
-    information [n]: precision of the model's log albedo; what it leaves open is no reason to distrust a sample.
+    information [n]: precision of the model's log albedo; what it leaves open is no reason to distrust a sample; shadow
+    [n, 3]: standard deviation of the model since borders of shadows may lie elsewhere.
     """
     error = model - samples.colours
     variance = 1.0 / noise.precision(samples.colours) + model**2 / (information[:, None] + PRIOR_SPREAD**-2)
+    variance += np.square(shadow)
     weight = 1.0 / (1.0 + error**2 / (scale**2 * variance))
     return np.where(satisfied(samples.limits, error), 0.0, weight).astype(np.float32)
 

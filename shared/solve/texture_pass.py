@@ -105,27 +105,31 @@ class TexturePass:
         parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]
         borders = [BorderSums(len(self.surface), self.viewer.error_mm) for _ in self.systematic]
         ahead = read_ahead(map(self.frame, self.progress(frames, label)))
-        for f, (samples, irradiance, reflection) in zip(frames, ahead, strict=True):
+        for f, (samples, irradiance, reflection, shadow) in zip(frames, ahead, strict=True):
             if material is None:
                 robust = (samples.limits == 0).astype(np.float32)
             else:
                 model = _model(material, samples, irradiance, reflection)
-                robust = robust_weight(model, samples, self.noise, material.information[samples.rows])
-            parts[self.light_index[f]].add(samples, irradiance, reflection, robust)
+                robust = robust_weight(model, samples, self.noise, material.information[samples.rows], shadow)
+            parts[self.light_index[f]].add(samples, irradiance, reflection, robust, shadow)
             borders[self.light_index[f]].add(samples)
         for part, trust in zip(parts, self.light_trust, strict=True):
             part.scale(trust)
-        systematic = [error + own.variance()[:, None] for error, own in zip(self.systematic, borders, strict=True)]
+        systematic = [error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
+                      for error, border, part in zip(self.systematic, borders, parts, strict=True)]
         return weigh_lights(parts, systematic, self.typical_albedo)
 
-    def frame(self, f: int) -> tuple[TexelSamples, np.ndarray, np.ndarray]:
-        """Samples of one frame with E and S [n, 3] at them."""
+    def frame(self, f: int) -> tuple[TexelSamples, np.ndarray, np.ndarray, np.ndarray]:
+        """Samples of one frame with E, S and the standard deviation of a typical albedo's radiance by the borders of
+        shadows [n, 3] at them."""
         clip = self.clip
         pose, picture, lens = clip.camera_from_head[f], clip.picture(f), self.intrinsics[f]
         view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
-        both = np.concatenate([self.shading.irradiance(f), self.shading.reflection(f)], axis=1)
-        samples, both = self.surface.samples(view, picture, lens, both)
-        return samples, both[:, :3], both[:, 3:]
+        shading = self.shading
+        shadow = shading.shadow_doubt(f) * self.typical_albedo.astype(np.float32)
+        shade = np.concatenate([shading.irradiance(f), shading.reflection(f), shadow], axis=1)
+        samples, shade = self.surface.samples(view, picture, lens, shade)
+        return samples, shade[:, :3], shade[:, 3:6], shade[:, 6:]
 
     def _close(self, evidence: Evidence, intensities: list[np.ndarray]) -> list[TexelMaterial]:
         """Albedo for each of some given intensities [T]; channels left open by the samples follow the others and the
@@ -175,7 +179,7 @@ class TexturePass:
         """Root mean square residual of each candidate on the held-out frames (linear, censored, trust-weighted)."""
         squared, total = np.zeros(len(candidates)), 0.0
         frames = self.progress(np.nonzero(~self.clip.fitted)[0], "texture, held-out frames")
-        for samples, irradiance, reflection in read_ahead(map(self.frame, frames)):
+        for samples, irradiance, reflection, _ in read_ahead(map(self.frame, frames)):
             total += 3.0 * float(samples.weight.sum())
             for k, material in enumerate(candidates):
                 error = _model(material, samples, irradiance, reflection) - samples.colours
