@@ -1,9 +1,10 @@
 """How much the samples of several lights count against each other, point by point.
 
 Where a light grazes the skin, or hardly reaches it, small errors of normals and bounces are large errors of the
-irradiance, the same in all its frames; another light, that does better there, should decide the albedo. And where the
-model follows one light worse than another (a lamp smaller than a texel of the light), its samples count less
-everywhere. The light's prior steps back as its samples do: how well a light is solved depends on its own samples.
+irradiance, the same in all its frames; another light, that does better there, should decide the albedo. So it should
+where a cast shadow ends, since the mesh says only about where that is. And where the model follows one light worse than
+another (a lamp smaller than a texel of the light), its samples count less everywhere. The light's prior steps back as
+its samples do: how well a light is solved depends on its own samples.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from shared.shading import irradiance_slope
+from shared.irradiance_errors import SHADOW_MM, irradiance_slope, shadow_doubt
 from shared.solve.appearance import AppearanceSolver
+from shared.solve.capture import Capture
 from shared.solve.texture import CORRELATED_FRAMES, IRRADIANCE_ERROR, NORMAL_ERROR
 
 LEAST_TRUST = 0.01
@@ -28,7 +30,10 @@ def weigh_samples(solver: AppearanceSolver, irradiance: torch.Tensor, model: tor
     trust = [max(min(spread) / value, LEAST_TRUST) for value in spread]
     along = torch.from_numpy(solver.frame_light.along(solver.state.light))
     albedo = torch.from_numpy(np.ascontiguousarray(solver.state.albedo.T, np.float32))
-    base = solver.trust * solver.precision / solver.reliability * ~silent
+    plain = solver.precision / solver.reliability
+    doubt = _shadow_doubt(solver.capture, along)
+    steady = 1.0 / (1.0 + plain * (albedo[..., None] * doubt).square())
+    base = solver.trust * plain * steady * ~silent
     shares = []
     for own, follows in zip(solver.light_frames, trust, strict=True):
         lit = irradiance[..., own]
@@ -37,12 +42,21 @@ def weigh_samples(solver: AppearanceSolver, irradiance: torch.Tensor, model: tor
                                  solver.capture.directions)
         turned = NORMAL_ERROR * torch.from_numpy(slope.T) / mean
         shared = (IRRADIANCE_ERROR * mean.median(1, keepdim=True).values / mean).square() + turned.square()
-        precision = (base[..., own] * lit.square()).sum(2) * albedo.square() / CORRELATED_FRAMES
+        power = (base[..., own] * lit.square()).sum(2)
+        shared += (base[..., own] * doubt[..., own].square()).sum(2) / power.clamp_min(1e-9)
+        precision = power * albedo.square() / CORRELATED_FRAMES
         shares.append(follows / (1.0 + precision * shared))
     shares = torch.stack(shares)
     shares = (shares / shares.max(0).values).clamp_min(LEAST_TRUST)
     by_frame = torch.empty_like(irradiance)
     for own, share in zip(solver.light_frames, shares, strict=True):
-        by_frame[..., own] = share[..., None]
+        by_frame[..., own] = share[..., None] * steady[..., own]
     solver.weigh(by_frame)
     return trust
+
+
+def _shadow_doubt(capture: Capture, along: torch.Tensor) -> torch.Tensor:
+    """[3, P, F] standard deviation of the irradiance over pi by the borders of shadows; along [J, F, 3]: the light."""
+    lights = along.reshape(len(along), -1).numpy()
+    doubt = shadow_doubt(capture.points, capture.transfer, lights, capture.directions, SHADOW_MM)
+    return torch.from_numpy(doubt).reshape(len(doubt), -1, 3).permute(2, 0, 1)
