@@ -175,6 +175,22 @@ def test_reflections_between_key_frames_are_interpolated():
         assert np.abs(coarse.reflection(f) - every.reflection(f))[front].max() < 0.02 * every.reflection(f).max()
 
 
+def test_doubt_about_shadows_is_interpolated_between_key_frames():
+    """A ball casts no shadows on itself, so that there is little of it; a frame's lies between those of its keys."""
+    poses = nods(np.linspace(0.0, 8.0, 9))
+    light = np.repeat(lamp(cube_directions(16)), 3, axis=1)
+    shading, _ = shade(sphere(40.0, 5), light, poses, key_step=np.radians(4.0))
+    doubts, brightest = np.stack([shading.shadow_doubt(f) for f in range(len(poses))]), shading.irradiance(0).max()
+    assert np.median(doubts) < 0.02 * brightest and doubts.max() < 0.2 * brightest
+    keys = key_frames(turned_so_far(poses), np.radians(4.0))
+    assert np.diff(keys).max() > 2
+    for low, high in zip(keys[:-1], keys[1:], strict=True):
+        least, most = np.sort(doubts[[low, high]], axis=0)
+        for between in doubts[low + 1 : high]:
+            assert (between >= least - 1e-6).all() and (between <= most + 1e-6).all()
+        assert (doubts[low] != doubts[high]).any()
+
+
 def test_vertices_without_shading_take_the_nearest():
     """A ball of which three vertices are shaded, then one of these said to lie deep in a cavity."""
     ball = sphere(80.0, 2)
