@@ -33,9 +33,9 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def normalised(vectors: np.ndarray) -> np.ndarray:
-    """[..., 3] -> unit length; the zero vector stays zero."""
-    x, y, z = np.moveaxis(vectors, -1, 0)  # a sum over so short an axis takes numpy ten times as long
-    return vectors / np.maximum(np.sqrt(x * x + y * y + z * z), 1e-20)[..., None]
+    """[..., N] -> unit length; the zero vector stays zero."""
+    squared = sum(part * part for part in np.moveaxis(vectors, -1, 0))  # numpy's sum along so short an axis is slow
+    return vectors / np.maximum(np.sqrt(squared), 1e-20)[..., None]
 
 
 def tangent_frames(normals: np.ndarray) -> np.ndarray:

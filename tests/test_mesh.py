@@ -80,3 +80,12 @@ def test_rasterize_leaves_uncovered_texels_empty():
     assert (face[8:, :8] >= 0).all()
     assert (face[:8] < 0).all() and (face[:, 8:] < 0).all()
     assert (bary[face < 0] == 0).all()
+
+
+@pytest.mark.parametrize("width", [2, 3, 4])
+def test_vectors_of_any_length_are_normalised(width):
+    vectors = np.random.default_rng(1).normal(size=(5, 7, width))
+    vectors[0, 0] = 0.0
+    unit = m.normalised(vectors)
+    assert np.linalg.norm(unit.reshape(-1, width)[1:], axis=1) == pytest.approx(1.0)
+    assert (unit[0, 0] == 0.0).all()
