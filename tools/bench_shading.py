@@ -2,9 +2,10 @@
 
     python -m tools.bench_shading OUT [--samples 256] [--pixels 96] [--mesh head statue] [--light window]
 
-Writes   OUT/shading.csv (one row per mesh, quantity and roughness), OUT/specular_MESH.svg, and one EXR of ours, theirs
-         and their ratio per row under OUT/pictures. split_sum and direction_sum are the transfer solver's two ways of
-         making a lobe, published_* the reference solver's renderer.
+Writes   OUT/shading.csv (one row per mesh, quantity and roughness), OUT/specular.svg (errors of the highlights over
+         the roughness, all meshes), and one EXR of ours, theirs and their ratio per row under OUT/pictures. split_sum
+         and direction_sum are the transfer solver's two ways of making a lobe, published_* the reference solver's
+         renderer.
 Compares radiance of the pixels that the mesh fills. mean: ratio of the sums, minus one. rms: root mean square error
          over the mean radiance; two renders with seeds of their own take the path tracer's noise out of it.
 Needs    pip install mitsuba.
@@ -216,11 +217,13 @@ def measure(
 
 
 def chart(path: Path, rows: list[dict]) -> None:
-    """Root mean square error of the highlights over roughness, one curve per way; rows of one mesh."""
+    """Root mean square error of the highlights over roughness, one curve per mesh and way."""
     curves = {}
-    for way in ("split_sum", "direction_sum", "published_split_sum"):
-        percent = np.array([100.0 * float(row["rms"]) for row in rows if row["quantity"] == way])
-        curves[way.replace("_", " ")] = np.where(percent < LARGEST_SHOWN, percent, np.nan)
+    for mesh in dict.fromkeys(row["mesh"] for row in rows):
+        for way in ("split_sum", "direction_sum", "published_split_sum"):
+            own = [row for row in rows if (row["mesh"], row["quantity"]) == (mesh, way)]
+            percent = np.array([100.0 * float(row["rms"]) for row in own])
+            curves[f"{mesh}: {way.replace('_', ' ')}"] = np.where(percent < LARGEST_SHOWN, percent, np.nan)
     options = {"x_label": "roughness", "y_label": "rms error of the highlight, %", "from_zero": True}
     save_line_chart(path, ROUGHNESSES, curves, **options)
 
@@ -254,8 +257,8 @@ def main(arguments: list[str] | None = None) -> int:
         own = measure(name, stage, options.samples, keep)
         for row in own:
             print(" ".join(f"{v:.4f}" if isinstance(v, float) else str(v) for v in row.values()), flush=True)
-        chart(options.out / f"specular_{name}.svg", own)
         rows += own
+    chart(options.out / "specular.svg", rows)
     with open(options.out / "shading.csv", "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()

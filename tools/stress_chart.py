@@ -16,7 +16,6 @@ _COLUMNS, _WIDTH, _HEIGHT, _LEFT, _TOP = 5, 220, 168, 38, 26
 _PLOT = (170, 88)
 _LOWEST, _HIGHEST = -3.0, 3.0
 """Powers of two of a score over what is allowed."""
-_MORE_COLOURS = ("#e69f00", "#56b4e9")
 VERDICT_COLOURS = {RIGHT: "#009e73", WARNED: "#56b4e9", SAID: "#e69f00", SILENT: "#d00000", FAILED: "#000000"}
 _STYLE = (
     "text{font:10px sans-serif;fill:#333}.name{font-weight:bold}.grid{stroke:#ddd}.limit{stroke:#888;"
@@ -50,7 +49,7 @@ def _panel(rows: list[dict]) -> str:
             place = f'x="{_LEFT - 4}" y="{_down(2.0**power) + 3:.1f}"'
             parts.append(f'<text {place} text-anchor="end">{2.0**power:g}</text>')
     zero = rows[0]["scores"]
-    for colour, name in zip((*COLOURS, *_MORE_COLOURS), LIMITS, strict=True):
+    for colour, name in zip(COLOURS, LIMITS, strict=True):
         known = [(x, row["scores"][name] / allowed(name, zero[name])) for x, row in zip(across, rows, strict=True)
                  if np.isfinite(row["scores"].get(name, np.nan))]
         points = " ".join(f"{x:.1f},{_down(ratio):.1f}" for x, ratio in known)
@@ -74,7 +73,7 @@ def _down(ratio: float) -> float:
 
 def _legend() -> str:
     parts, x = [], _LEFT
-    for colour, name in zip((*COLOURS, *_MORE_COLOURS), LIMITS, strict=True):
+    for colour, name in zip(COLOURS, LIMITS, strict=True):
         parts.append(f'<path d="M{x} 10h18" stroke="{colour}" stroke-width="3"/>'
                      f'<text x="{x + 23}" y="14">{name}</text>')
         x += 110
