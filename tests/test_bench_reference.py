@@ -3,7 +3,7 @@
 import pytest
 
 from tools.bench_appearance import settings_of
-from tools.bench_reference import COMPARED, FIELDS, TRANSFER_SIZES, Log, chart
+from tools.bench_reference import COMPARED, FIELDS, TRANSFER_SIZES, Log, chart, compared_table
 
 
 def row(label, solver, seconds, error, iteration=10):
@@ -24,13 +24,23 @@ def test_the_chart_says_how_much_sooner(tmp_path, capsys):
         log.add(row("published", "reference", seconds, error))
     for seconds, error in ((4.0, 2.5), (8.0, 1.5), (60.0, 1.0)):
         log.add(row("ours", "transfer", seconds, error))
-    log.add(row("matte", "transfer", 1.0, 0.5))
     capsys.readouterr()
     chart(log, tmp_path / "accuracy.svg")
     assert "published: best 2.000 after 400 s" in (said := capsys.readouterr().out) and said.strip().endswith("50 x")
     assert "3.000 in the first half of 400 s, 2.000 in all" in said
     picture = (tmp_path / "accuracy.svg").read_text()
-    assert picture.count('class="curve"') == 2 and "published" in picture and "matte" not in picture
+    assert picture.count('class="curve"') == 2 and "published" in picture
+
+
+def test_the_table_has_the_last_row_of_each_model_and_solver():
+    """In the models' order."""
+    rows = [row("matte", "reference", 60.0, 5.0), row("matte", "reference", 120.0, 4.0)]
+    rows += [row("full model", "transfer", 9.0, 2.0) | {"size": size} for size in ("draft", "small")]
+    lines = compared_table(rows).splitlines()
+    assert [line.split(" | ")[:2] for line in lines[2:]] == [
+        ["| full model", "transfer, draft"], ["| full model", "transfer, small"], ["| matte", "reference"]
+    ]
+    assert lines[-1].endswith("| 120 | 10 | 4.00 | 26.0 dB |")
 
 
 @pytest.mark.parametrize("changes", [*TRANSFER_SIZES.values(), *COMPARED.values()])

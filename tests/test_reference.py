@@ -16,9 +16,9 @@ from shared.solve.inverse import solve_clip, summarise
 from shared.solve.inverse_parameters import read_settings
 from shared.solve.inverse_problem import InverseSettings, frames_to_fit
 from shared.solve.reference import ReferenceSolver
-from shared.solve.reference_clip import Checkpoint
+from shared.solve.reference_clip import Checkpoint, solve_by_reference
 from shared.solve.reference_settings import ReferenceSettings
-from shared.solve.reference_shade import Sampling
+from shared.solve.reference_shade import Sampling, Shader
 from shared.solve.reference_shape import LargeSteps
 from stages.inverse_render import STAGE
 
@@ -138,6 +138,24 @@ def test_light_models_are_those_of_the_transfer_solver(clip, model):
     )
     assert last.solution.fitted < (0.95 if model == "camera" else 0.85) * first.solution.fitted
     assert last.solution.state.light.min() > 0.0 and np.ptp(last.solution.state.light) > 0.05
+
+
+def test_the_other_methods_models_are_followed(clip, monkeypatch):
+    """Matte skin has no highlight; of three frames it sees no other; without visibility none of
+    its rays seeks the light."""
+    changes = {"iterations": 3, "pixels": 100}
+    matte = settings_of(clip, **changes, sampling=Sampling(8, 8, 4, specular=False))
+    assert (solve_clip(clip, matte, nothing, nothing).maps["specular_intensity"] == 0.0).all()
+    poses, three = [], replace(settings_of(clip, **changes), fit_frames=3)
+    fitted = frames_to_fit(clip, three, SurfaceViewer.of(clip.mesh))
+    solve_by_reference(clip, three, three.reference, fitted, nothing, nothing,
+                       lambda solver, losses: poses.append(solver.views.camera_from_head))
+    assert len(poses) == 3 and all(np.array_equal(seen, clip.camera_from_head[fitted]) for seen in poses)
+    monkeypatch.setattr(Shader, "_open", None)
+    unshadowed = settings_of(clip, **changes, sampling=Sampling(visibility=False))
+    assert np.isfinite(solve_clip(clip, unshadowed, nothing, nothing).maps["diffuse_albedo"]).all()
+    with pytest.raises(TypeError):
+        solve_clip(clip, settings_of(clip, **changes), nothing, nothing)
 
 
 def test_large_steps_are_a_change_of_variables(clip):
