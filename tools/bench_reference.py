@@ -39,7 +39,7 @@ from tools.svg_file import save_line_chart
 from tools.tradeoff_cases import LIGHTENED
 
 FIELDS = ("label", "solver", "size", "seconds", "iteration", "delta_e2000_median", "delta_e2000_p90", "psnr_linear")
-FIXED_SHAPE = {"shape": False, "local_roughness": False}
+FIXED_SHAPE = {"shape": False, "local_roughness": False, "normal_map": False}
 TRANSFER_SIZES: dict[str, dict] = {
     "tiny": {
         "points": 200, "directions": 128, "bounce_nodes": 50, "light_resolution": 4, "light_frames": 6,
