@@ -217,12 +217,12 @@ def measure(
 
 
 def chart(path: Path, rows: list[dict]) -> None:
-    """Root mean square error of the highlights over roughness, one curve per mesh and way."""
+    """Root mean square error of the highlights over roughness, one curve per mesh and way; 0: lost in the noise."""
     curves = {}
     for mesh in dict.fromkeys(row["mesh"] for row in rows):
         for way in ("split_sum", "direction_sum", "published_split_sum"):
             own = [row for row in rows if (row["mesh"], row["quantity"]) == (mesh, way)]
-            percent = np.array([100.0 * float(row["rms"]) for row in own])
+            percent = np.array([100.0 * max(0.0, float(row["rms"])) for row in own])
             curves[f"{mesh}: {way.replace('_', ' ')}"] = np.where(percent < LARGEST_SHOWN, percent, np.nan)
     options = {"x_label": "roughness", "y_label": "rms error of the highlight, %", "from_zero": True}
     save_line_chart(path, ROUGHNESSES, curves, **options)
