@@ -61,13 +61,24 @@ def test_residuals_come_down_to_the_noise(solution):
     assert 0.25 <= solution.state.roughness <= 0.7
 
 
-def test_the_best_held_out_state_wins(truth, solution):
+def test_the_last_of_the_best_held_out_states_wins(truth, solution):
     """Where the prior on skin has nothing against it."""
     count = Settings().independent * (~truth[0].fitted).mean()
-    judged = [record["held_out"] * np.sqrt(1.0 + 2.0 * record["skin_prior"] / count)
-              for record in solution.iterations[SHAPING_STEPS:]]
-    assert solution.held_out == solution.iterations[SHAPING_STEPS + int(np.argmin(judged))]["held_out"]
+    judged = np.array([record["held_out"] * np.sqrt(1.0 + 2.0 * record["skin_prior"] / count)
+                       for record in solution.iterations[SHAPING_STEPS:]])
+    last = int(np.nonzero(judged <= 1.003 * judged.min())[0][-1])
+    assert solution.held_out == solution.iterations[SHAPING_STEPS + last]["held_out"]
     assert solution.iterations[0]["held_out"] > 2.0 * solution.held_out
+
+
+def test_the_fit_goes_on_until_the_scale_rests(truth):
+    """Highlights tell the scale, step by step, while the residual stays."""
+    settings = Settings(resolutions=(8,), steps=20, noise=(0.003, 0.01), roughness=0.45)
+    found = fit_appearance(truth[0], settings)
+    assert found.trusted and SHAPING_STEPS + 2 < len(found.iterations) < 20
+    assert found.iterations[-1]["rescaled"] < 0.01
+    further = fit_appearance(truth[0], settings, start=found, least=4)
+    assert np.abs(np.log(further.state.albedo / found.state.albedo)).max(1).mean() < 0.02
 
 
 def test_the_fit_stops_where_held_out_frames_stop_improving(matte):
@@ -83,11 +94,12 @@ def test_the_fit_stops_where_held_out_frames_stop_improving(matte):
 
 
 def test_a_fit_goes_on_from_a_solution(truth, solution):
-    """From the solution of the same capture: the last resolution alone, in few steps, to the same residual or below."""
-    settings = Settings(resolutions=(4, 8), steps=7, noise=(0.003, 0.01), roughness=0.45)
+    """From the solution of the same capture: the last resolution alone, until the scale rests, to the same residual or
+    below."""
+    settings = Settings(resolutions=(4, 8), steps=12, noise=(0.003, 0.01), roughness=0.45)
     again = fit_appearance(truth[0], settings, start=solution)
     assert {record["resolution"] for record in again.iterations} == {8}
-    assert len(again.iterations) <= 5
+    assert len(again.iterations) <= 8
     assert again.held_out < 1.02 * solution.held_out
     distrustful = fit_appearance(truth[0], settings, start=replace(solution, trusted=False))
     assert not distrustful.trusted and again.trusted

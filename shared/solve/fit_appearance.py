@@ -21,6 +21,10 @@ _WORTHWHILE, _WORTHWHILE_COARSE = 0.003, 0.03
 """A step that lowers the held-out residual by less than this fraction is the last of its resolution; the first of
 several resolutions is left earlier, since what it cannot resolve keeps its residual high."""
 
+_SETTLED_SCALE = 0.01
+"""A resolution goes on while a step changes the light's scale by more than this, in the logarithm: highlights say what
+it is, for the roughness of the moment, and the residual hardly feels it. Without highlights the priors alone do."""
+
 _LARGEST_RISE = 1.05
 """A step after which the robust loss on fitted samples is higher by more than this factor is undone, and ends its
 resolution: the specular intensity and the scale follow priors as well as samples, and on a clip that contradicts the
@@ -34,11 +38,11 @@ ROUGHNESS_SEARCHES = (2, 1)
 
 @dataclass(frozen=True)
 class Solution:
-    """The best State by held-out residual; iterations: one record per step; fitted and held_out: its residuals; gloss:
-    where roughness varies over the skin, how, and gloss_record what the held-out frames said to that; trusted: whether
-    highlights took part to the end; frame_errors [F]: each frame's mean absolute residual; local_specular: where the
-    specular intensity varies with the face's segments, how; light_trust: of several lights, how much samples of each
-    count against those of the light that the model follows best."""
+    """The last State of those that are best by held-out residual; iterations: one record per step; fitted and held_out:
+    its residuals; gloss: where roughness varies over the skin, how, and gloss_record what the held-out frames said to
+    that; trusted: whether highlights took part to the end; frame_errors [F]: each frame's mean absolute residual;
+    local_specular: where the specular intensity varies with the face's segments, how; light_trust: of several lights,
+    how much samples of each count against those of the light that the model follows best."""
 
     state: State
     iterations: tuple[dict, ...]
@@ -66,7 +70,8 @@ def fit_appearance(
 
     The first steps only give the light its shape; highlights, which then begin to say something about the scale,
     take part from the fourth, but not again after a step that had to be undone. Only states after the first steps, of
-    the light model asked for, can win, or the one that a step was undone to.
+    the light model asked for, can win, or the one that a step was undone to; of those that do about as well the last,
+    whose scale has come to rest.
     """
     solver = AppearanceSolver(capture, settings)
     # A clip too short to hold frames out is judged by the fitted ones.
@@ -100,15 +105,18 @@ def fit_appearance(
             records.append(record)
             report(record)
             judged = judge(record)
-            if not shaping and model == settings.light_model and (best is None or judged < best[0]):
-                best = (judged, record, _copy(solver.state), by_frame)
+            if not shaping and model == settings.light_model:
+                lowest = judged if best is None else min(judged, best[0])
+                if best is None or judged <= lowest * (1.0 + _WORTHWHILE):
+                    best = (lowest, record, _copy(solver.state), by_frame)
             settled = judged > last * (1.0 - _SETTLED)
             wanted = settings.specular and settings.search_roughness and number + 1 < settings.steps
             if wanted and settled and searches < ROUGHNESS_SEARCHES[0 if stage == 0 and start is None else 1]:
                 solver.state.roughness, solver.lobes = search_roughness(solver), None
                 searches += 1
             elif not shaping and number >= enough and judged > last * (1.0 - worthwhile):
-                break
+                if not trusts or record["rescaled"] < _SETTLED_SCALE:
+                    break
             last = judged
     _, record, state, by_frame = best
     errors = record["fitted"], record["held_out"]
@@ -147,7 +155,7 @@ def _step(
     before, spread = solver.loss(solver.model(step.irradiance, step.reflection))
     if moves:
         step.take()
-    step.settle()
+    rescaled = step.settle()
     state = solver.state
     state.node_albedo = state.albedo[solver.node_to_point]
     model = solver.model(step.irradiance, step.reflection)
@@ -161,6 +169,7 @@ def _step(
         "fitted": fitted,
         "held_out": held_out,
         "cost": step.before,
+        "rescaled": rescaled,
         "skin_prior": step.unlikely_skin(step.albedo),
         "specular_intensity": state.specular,
         "roughness": state.roughness,

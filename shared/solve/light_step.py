@@ -84,8 +84,9 @@ class LightStep:
         known = (curvature / (curvature + ALBEDO_PULL)).min(0).values
         return self.solver.skin_prior.at(_log_of(self.albedo), known.double().numpy())
 
-    def settle(self) -> None:
-        """Specular intensity, the light's scale and the albedo for the present light, weights as they were."""
+    def settle(self) -> float:
+        """Specular intensity, the light's scale and the albedo for the present light, weights as they were -> by how
+        much the scale changed at most, in the logarithm."""
         solver, settings = self.solver, self.solver.settings
         self.irradiance, self.reflection = solver.forward(solver.state.light)
         self._fit_points()
@@ -106,6 +107,7 @@ class LightStep:
         solver.state.specular = specular if settings.specular else 0.0
         self.irradiance, self.reflection = self.irradiance * factor, self.reflection * factor
         self._fit_points()
+        return float(np.abs(log_factor).max())
 
     def cost(self, params: np.ndarray) -> float:
         """Data and priors with albedo and, once highlights count, specular intensity eliminated; weights held."""
