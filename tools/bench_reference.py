@@ -97,7 +97,7 @@ class Log:
 
     def add(self, row: dict) -> None:
         with open(self.path, "a", newline="", encoding="utf-8") as file:
-            csv.DictWriter(file, FIELDS, extrasaction="ignore").writerow(row)
+            csv.DictWriter(file, FIELDS, extrasaction="ignore", lineterminator="\n").writerow(row)
         print(" ".join(f"{row[k]:.3f}" if isinstance(row[k], float) else str(row[k]) for k in FIELDS), flush=True)
 
     def rows(self) -> list[dict]:
