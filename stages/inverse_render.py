@@ -5,9 +5,9 @@ Reads    sample_frames (frames, masks), track_landmarks (poses, mesh, segments, 
 Writes   maps/*.exr, envmap.exr, mesh.npz, shape.png, poses.npz, renders/*.exr, solve.json.
 Method   What no track reaches (ears, skull, jaw) moves until the mesh's outline meets the border of the person masks.
          In head space a surface point's view of the sphere never changes, so visibility and bounces are traced once
-         and reused by all frames. Light by Gauss-Newton with the albedo eliminated, specular intensity in closed form,
-         roughness by line search, stopping on held-out frames; a prior on how skin varies over a face keeps the
-         colours of a room out of the albedo. Under that light the mesh is refined from parallax and shading by
+         and reused by all frames. Light by Gauss-Newton with albedo, specular intensity and roughness eliminated,
+         stopping on held-out frames; a prior on how skin varies over a face keeps the colours of a room out of the
+         albedo. Under that light the mesh is refined from parallax and shading by
          Gauss-Newton, coarse to fine, the light solved anew, and the refined mesh kept if held-out frames fit better.
          Or (model=auto) the model is chosen first, on few points and frames: shared/solve/ladder.py. Then albedo and
          specular intensity per texel in closed form, streaming over the frames; samples where a cast shadow ends, which
@@ -34,7 +34,7 @@ LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 STAGE = Stage(
     name="inverse_render",
-    version=13,
+    version=14,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -76,7 +76,7 @@ STAGE = Stage(
         Parameter("bounce", bool, True, "Count light that bounces between parts of the head."),
         Parameter("specular", bool, True, "Model specular reflection."),
         Parameter("roughness", float, 0.45, "Roughness to start from.", "", 0.1, 0.7),
-        Parameter("search_roughness", bool, True, "Search the roughness; else it stays at its start."),
+        Parameter("search_roughness", bool, True, "Fit the roughness; else it stays at its start."),
         Parameter("local_roughness", bool, True, "Let roughness vary over the skin where held-out frames gain by it."),
         Parameter("specular_prior", float, 0.7, "Expected specular intensity of skin; index of refraction 1.4: 0.7.",
                   "", 0.01, 2.0),

@@ -8,9 +8,9 @@ Method. Albedo is eliminated: for any light it is a weighted least-squares solut
 the residual that no albedo can explain drives the light (variable projection; Golub and Pereyra 1973, with Kaufman's
 1975 approximation of the derivative). The light takes Gauss-Newton steps, each solved by conjugate gradients with
 products only: a step touches the clip some twenty times and costs about as much as rendering it that often. Specular
-intensity is closed form after the same elimination; roughness a line search. Weights are robust (Cauchy, by
-reweighting) and clipped or crushed samples only push when the model violates what they say. Steps end when frames
-that were held out stop improving.
+intensity and the logarithm of the roughness are unknowns of the same step, eliminated likewise. Weights are robust
+(Cauchy, by reweighting) and clipped or crushed samples only push when the model violates what they say. Steps end when
+frames that were held out stop improving.
 """
 
 from __future__ import annotations
@@ -21,18 +21,23 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from shared.lobe_tables import specular_tables
+from shared.lobe_tables import specular_slopes, specular_tables
 from shared.lobes import LobeTable
 from shared.shading import Material
 from shared.solve.capture import Capture
 from shared.solve.light import FrameLight, LightPriors
 from shared.solve.light_models import LightModel, make_light_model
+from shared.solve.products import per_channel, per_channel_transposed, reflect
 from shared.solve.sample_errors import SampleErrors
 from shared.solve.scale import Highlights, most_likely_irradiance
 from shared.solve.skin_prior import SkinPrior, SkinVariation
 from shared.transfer import nearest_points
 
 MINIMUM_ALBEDO, MAXIMUM_ALBEDO = 0.003, 1.0
+ROUGHNESS_RANGE, ROUGHNESS_SPREAD = (0.1, 0.7), 0.35
+"""Of skin; the spread is the standard deviation of the prior on its logarithm, about where the fit starts."""
+LARGEST_ROUGHENING = 0.08
+"""Of a step, in the logarithm: lobes are linearised, and their peak goes with the inverse fourth power."""
 ALBEDO_PULL = 25.0
 """Precision of the prior on a point's albedo: a standard deviation of 0.2."""
 
@@ -104,6 +109,7 @@ class AppearanceSolver(SampleErrors):
         self.direct = torch.from_numpy(capture.transfer.direct.astype(np.float32))
         self.trust_highlights, self.prior_shares = False, None
         self.lobes: torch.Tensor | None = None
+        self.slopes: torch.Tensor | None = None
         self.state = self._start()
         self.set_light(settings.light_schedule[0])
 
@@ -188,43 +194,47 @@ class AppearanceSolver(SampleErrors):
         if self.settings.bounce:
             share = Material(self.state.node_albedo, self.state.specular, self.state.roughness).bounce_albedo()
             # node_radiosity @ direct, without the matrix in between
-            form, node_direct = (torch.from_numpy(table.astype(np.float32))
-                                 for table in (self.capture.node_transfer.bounce, self.capture.node_transfer.direct))
-            albedo = torch.from_numpy(share.T.astype(np.float32))[..., None]
-            radiosity = torch.linalg.solve(torch.eye(len(form)) - albedo * form, albedo * node_direct)
-            self.baked = self.direct + torch.from_numpy(self.capture.transfer.bounce.astype(np.float32)) @ radiosity
+            form, node_direct, bounce = (table.astype(np.float32) for table in (
+                self.capture.node_transfer.bounce, self.capture.node_transfer.direct, self.capture.transfer.bounce))
+            albedo = share.T.astype(np.float32)[..., None]
+            radiosity = np.linalg.solve(np.eye(len(form), dtype=np.float32) - albedo * form, albedo * node_direct)
+            self.baked = self.direct + torch.from_numpy(bounce @ radiosity)
 
     def bake_lobes(self, roughness: float | np.ndarray | None = None) -> None:
         """The specular tables [F, P, J] for the present roughness, or for another one or each point's own [P]."""
         roughness = self.state.roughness if roughness is None else roughness
         self.lobes, blocked = specular_tables(self.table, self.capture.samples.towards_camera, roughness)
-        share = torch.from_numpy(blocked / np.maximum(self.capture.transfer.blocked, 1e-3)[:, None])
-        self.blocked_share = share[None]
+        self.blocked_share, self.slopes = self._of_blocked_light(blocked), None
+
+    def bake_slopes(self) -> None:
+        """Their derivatives by the logarithm of the roughness."""
+        self.slopes, blocked = specular_slopes(self.table, self.capture.samples.towards_camera, self.state.roughness)
+        self.blocked_slope = self._of_blocked_light(blocked)
+
+    def _of_blocked_light(self, weight: np.ndarray) -> torch.Tensor:
+        """Weights [P, F] on what blocks a lobe -> on the indirect irradiance, [1, P, F]."""
+        return torch.from_numpy(weight / np.maximum(self.capture.transfer.blocked, 1e-3)[:, None])[None]
 
     def forward(self, light: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
         """Texels [K, 3] -> irradiance E and reflection S, both [3, P, F]."""
         along = torch.from_numpy(self.frame_light.along(light))
-        channels = along.permute(2, 0, 1).contiguous()
-        irradiance = torch.bmm(self.baked, channels)
+        irradiance = per_channel(self.baked, along.permute(2, 0, 1))
         if not self.settings.specular:
             return irradiance, torch.zeros_like(irradiance)
-        reflection = self.reflect(along)
-        indirect = irradiance - torch.bmm(self.direct[None].expand(3, -1, -1), channels)
-        return irradiance, reflection + self.blocked_share * indirect
+        return irradiance, reflect(self.lobes, along) + self.blocked_share * self._indirect(along, irradiance)
 
-    def reflect(self, along: torch.Tensor) -> torch.Tensor:
-        frames = along.permute(1, 0, 2).to(torch.bfloat16).contiguous()
-        return torch.bmm(self.lobes, frames).float().permute(2, 1, 0)
+    def forward_slope(self, light: np.ndarray, irradiance: torch.Tensor) -> torch.Tensor:
+        """Texels [K, 3] and their irradiance -> derivative of S by the logarithm of the roughness, [3, P, F]."""
+        along = torch.from_numpy(self.frame_light.along(light))
+        return reflect(self.slopes, along) + self.blocked_slope * self._indirect(along, irradiance)
+
+    def _indirect(self, along: torch.Tensor, irradiance: torch.Tensor) -> torch.Tensor:
+        return irradiance - per_channel(self.direct[None].expand(3, -1, -1), along.permute(2, 0, 1))
 
     def model(self, irradiance: torch.Tensor, reflection: torch.Tensor) -> torch.Tensor:
         """Radiance [3, P, F] for the present albedo and specular intensity."""
         albedo = torch.from_numpy(np.ascontiguousarray(self.state.albedo.T, np.float32))[..., None]
         return albedo * irradiance + self.state.specular * reflection
-
-    def reflect_adjoint(self, values: torch.Tensor) -> torch.Tensor:
-        """Transpose of the lobe sums: [3, P, F] -> [J, F, 3]."""
-        frames = values.permute(2, 1, 0).to(torch.bfloat16).contiguous()
-        return torch.bmm(self.lobes.transpose(1, 2), frames).float().permute(1, 0, 2)
 
     def mean_on_skin(self, albedo, irradiance) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Log of the skin's mean albedo [3], log of its mean irradiance [3], and that mean's derivative by the
@@ -233,7 +243,7 @@ class AppearanceSolver(SampleErrors):
         total = weight.sum()
         mean = (weight * irradiance).sum((1, 2)) / total
         log_albedo = torch.log((weight * albedo).sum((1, 2)) / total)
-        spread = torch.bmm(self.baked.transpose(1, 2), (weight / total / mean[:, None, None]).contiguous())
+        spread = per_channel_transposed(self.baked, (weight / total / mean[:, None, None]).expand_as(irradiance))
         gauge = self.frame_light.adjoint(spread.permute(1, 2, 0).contiguous().numpy())
         return log_albedo.double().numpy(), torch.log(mean).double().numpy(), gauge
 
@@ -246,15 +256,13 @@ class AppearanceSolver(SampleErrors):
         return torch.log(torch.stack(own) / mean).double().numpy()
 
     # ------------------------------------------------------------------ eliminated unknowns
-    def eliminate(self, irradiance, reflection, weight, specular: float | None = None) -> torch.Tensor:
-        """Albedo [3, P, 1] that fits best given light and specular intensity (the state's when None), from the
-        fitted frames.
+    def eliminate(self, irradiance, highlights, weight) -> torch.Tensor:
+        """Albedo [3, P, 1] that fits best beside highlights [3, P, F], from the fitted frames.
 
         A weak pull to the skin's typical albedo decides where no sample says anything.
         """
         weight = weight * self.fitted
-        specular = self.state.specular if specular is None else specular
-        moment = (weight * irradiance * (self.colours - specular * reflection)).sum(2, keepdim=True)
+        moment = (weight * irradiance * (self.colours - highlights)).sum(2, keepdim=True)
         curvature = (weight * irradiance * irradiance).sum(2, keepdim=True)
         albedo = (moment + ALBEDO_PULL * self.typical_albedo) / (curvature + ALBEDO_PULL)
         return albedo.clamp(MINIMUM_ALBEDO, MAXIMUM_ALBEDO)
@@ -273,6 +281,12 @@ class AppearanceSolver(SampleErrors):
         """[3, 1, 1]: the skin points' median albedo."""
         median = np.median(self.state.albedo[self.capture.skin], axis=0)
         return torch.from_numpy(median.astype(np.float32))[:, None, None]
+
+    def roughen(self, change: float) -> None:
+        """Changes the log roughness, at most by what lobes may be linearised over, and bakes what follows from it."""
+        change = float(np.clip(change, -LARGEST_ROUGHENING, LARGEST_ROUGHENING))
+        self.state.roughness = float(np.clip(self.state.roughness * np.exp(change), *ROUGHNESS_RANGE))
+        self.bake_lobes()
 
     def highlights(self, irradiance, reflection, weight) -> Highlights:
         """What the samples say about the specular intensity, per channel, with albedo eliminated."""

@@ -1,4 +1,4 @@
-"""The whole appearance fit: light steps from coarse to fine, roughness by line search, a stop on held-out frames."""
+"""The whole appearance fit: light steps from coarse to fine, a stop on held-out frames."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-import torch
 
-from shared.solve.appearance import AppearanceSolver, Settings, State
+from shared.solve.appearance import LARGEST_ROUGHENING, AppearanceSolver, Settings, State
 from shared.solve.capture import Capture
 from shared.solve.light_step import LightStep
 from shared.solve.light_trust import weigh_samples
-from shared.solve.local_roughness import ROUGHNESS_RANGE, GlossEquations, local_roughness
+from shared.solve.local_roughness import GlossEquations, local_roughness
 
 SHAPING_STEPS = 3
-_ROUGHNESS_FACTOR = 1.18
 _WORTHWHILE, _WORTHWHILE_COARSE = 0.003, 0.03
 """A step that lowers the held-out residual by less than this fraction is the last of its resolution; the first of
 several resolutions is left earlier, since what it cannot resolve keeps its residual high."""
@@ -25,15 +23,13 @@ _SETTLED_SCALE = 0.01
 """A resolution goes on while a step changes the light's scale by more than this, in the logarithm: highlights say what
 it is, for the roughness of the moment, and the residual hardly feels it. Without highlights the priors alone do."""
 
+_ROUGHNESS_STEPS = 8
+"""At most, of the roughness by itself before a step of all."""
+
 _LARGEST_RISE = 1.05
 """A step after which the robust loss on fitted samples is higher by more than this factor is undone, and ends its
 resolution: the specular intensity and the scale follow priors as well as samples, and on a clip that contradicts the
 model (an expression that changes, a palette of few colours) they can lead away from it."""
-
-_SETTLED = 0.06
-"""Roughness is searched once steps lower the residual by less than this: under a light that still takes shape, blur
-of the light would pass for roughness. At most as often per resolution as ROUGHNESS_SEARCHES says, first and later."""
-ROUGHNESS_SEARCHES = (2, 1)
 
 
 @dataclass(frozen=True)
@@ -84,7 +80,7 @@ def fit_appearance(
         trusts, first = trusts and start.trusted, len(schedule) - 1
     for stage, (model, resolution) in list(enumerate(schedule))[first:]:
         solver.set_light((model, resolution))
-        last, searches = np.inf, 0
+        last = np.inf
         worthwhile = _WORTHWHILE if stage == len(schedule) - 1 else _WORTHWHILE_COARSE
         shaping_steps = min(SHAPING_STEPS, settings.steps - 1) if stage == 0 and start is None else 0
         enough = shaping_steps + 2 if stage == 0 and start is None else least
@@ -109,12 +105,7 @@ def fit_appearance(
                 lowest = judged if best is None else min(judged, best[0])
                 if best is None or judged <= lowest * (1.0 + _WORTHWHILE):
                     best = (lowest, record, _copy(solver.state), by_frame)
-            settled = judged > last * (1.0 - _SETTLED)
-            wanted = settings.specular and settings.search_roughness and number + 1 < settings.steps
-            if wanted and settled and searches < ROUGHNESS_SEARCHES[0 if stage == 0 and start is None else 1]:
-                solver.state.roughness, solver.lobes = search_roughness(solver), None
-                searches += 1
-            elif not shaping and number >= enough and judged > last * (1.0 - worthwhile):
+            if not shaping and number >= enough and judged > last * (1.0 - worthwhile):
                 if not trusts or record["rescaled"] < _SETTLED_SCALE:
                     break
             last = judged
@@ -151,8 +142,8 @@ def _step(
     solver.bake()
     if settings.specular and solver.lobes is None:
         solver.bake_lobes()
-    step = LightStep(solver)
-    before, spread = solver.loss(solver.model(step.irradiance, step.reflection))
+    step = _linearised(solver)
+    before, spread = solver.loss(step.radiance)
     if moves:
         step.take()
     rescaled = step.settle()
@@ -176,32 +167,17 @@ def _step(
     }, rise, solver.frame_errors(model)
 
 
+def _linearised(solver: AppearanceSolver) -> LightStep:
+    """The linearised problem, where highlights count at about the roughness that they have in the present light: until
+    then they would lead the scale astray."""
+    step = LightStep(solver)
+    for _ in range(_ROUGHNESS_STEPS):
+        if step.gloss is None or abs(step.gloss.change_of_roughness) < LARGEST_ROUGHENING:
+            break
+        solver.roughen(step.gloss.change_of_roughness)
+        step = LightStep(solver)
+    return step
+
+
 def _copy(state: State) -> State:
     return replace(state, params=state.params.copy(), albedo=state.albedo.copy())
-
-
-def search_roughness(solver: AppearanceSolver, stride: int = 4) -> float:
-    """Three roughnesses around the present one on a subset of points, the parabola's minimum in the logarithm."""
-    subset = solver.subset(slice(None, None, stride))
-    subset.bake_lobes()
-    weight = subset.weights(subset.model(*subset.forward(subset.state.light))) * subset.fitted
-    logs = np.log(solver.state.roughness) + np.log(_ROUGHNESS_FACTOR) * np.array([-1.0, 0.0, 1.0])
-    costs = [_roughness_cost(subset, float(np.exp(value)), weight) for value in logs]
-    curvature = costs[0] - 2.0 * costs[1] + costs[2]
-    if curvature <= 0.0:
-        best = logs[int(np.argmin(costs))]
-    else:
-        offset = np.clip(0.5 * (costs[0] - costs[2]) / curvature, -1.5, 1.5)
-        best = logs[1] + offset * np.log(_ROUGHNESS_FACTOR)
-    return float(np.clip(np.exp(best), *ROUGHNESS_RANGE))
-
-
-def _roughness_cost(solver: AppearanceSolver, roughness: float, weight: torch.Tensor) -> float:
-    """Weighted squared residual with albedo and specular intensity refitted under fixed weights."""
-    solver.state.roughness = roughness
-    solver.bake_lobes()
-    irradiance, reflection = solver.forward(solver.state.light)
-    solver.state.specular = solver.highlights(irradiance, reflection, weight).pooled
-    albedo = solver.eliminate(irradiance, reflection, weight)
-    error = albedo * irradiance + solver.state.specular * reflection - solver.colours
-    return float((weight * error.square()).sum())

@@ -127,6 +127,6 @@ class GlossLadder:
         intensity = solver.state.specular if specular is None else specular.specular_at(positions)
         intensity = np.broadcast_to(intensity, len(positions)).astype(np.float32)
         shown = reflection * torch.from_numpy(intensity)[None, :, None]
-        albedo = solver.eliminate(self.irradiance, shown, self.weight, 1.0)
+        albedo = solver.eliminate(self.irradiance, shown, self.weight)
         errors = solver.frame_errors(albedo * self.irradiance + shown)[~solver.capture.fitted]
         return replace(self.trial, errors=errors, seconds=time.perf_counter() - begun)

@@ -2,8 +2,9 @@
 
 The step solves (J^T W J + priors) d = -gradient by conjugate gradients. J is never formed: its product with a change
 of light renders that change for all points and frames and removes what a change of albedo, and once highlights count
-of the specular intensity under its prior, would absorb. That makes J^T W J a Schur complement: its transpose needs no
-second projection.
+of the specular intensity and the roughness under their priors, would absorb. That makes J^T W J a Schur complement: its
+transpose needs no second projection. A light a little too blurred and a lobe a little too narrow show nearly the same,
+so that steps of the light and of the roughness in turn would creep.
 
 References: Golub and Pereyra, The differentiation of pseudo-inverses and nonlinear least squares problems whose
 variables separate, 1973; Kaufman, A variable projection method for solving separable nonlinear least squares
@@ -17,7 +18,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from shared.solve.appearance import ALBEDO_PULL, AppearanceSolver
+from shared.solve.appearance import ALBEDO_PULL, LARGEST_ROUGHENING, AppearanceSolver
+from shared.solve.gloss_fit import GlossFit
+from shared.solve.products import per_channel, per_channel_transposed, reflect, reflect_transposed
 from shared.solve.scale import settle_scale
 from shared.solve.skin_prior import SkinPull
 
@@ -25,7 +28,10 @@ _LARGEST_RISE, _LARGEST_FALL = 1.5, 4.0
 """Bounds on a step of the log light, each texel by itself: the linearisation of exp holds for a rise of this size; a
 texel that wants to go dark may fall further, and must not slow the others down."""
 
-PRECISION, PRECISION_OF_SEVERAL = (15, 0.02), (60, 0.002)
+_SETTLED = 0.03
+"""The scale follows the highlights once a step changes the log roughness by no more."""
+
+PRECISION, PRECISION_OF_SEVERAL = (20, 0.01), (60, 0.002)
 """Most products of a step, and by how much its residual must fall. One light's errors against another's, with an albedo
 between them, are what the samples tell least of, and come last: steps that stop before leave them in the albedo."""
 
@@ -62,18 +68,37 @@ class LightStep:
         self.solver = solver
         self.model = solver.state.light_model
         self.light = solver.state.light
+        self.seeks_roughness = solver.trust_highlights and solver.settings.search_roughness
+        if self.seeks_roughness and solver.slopes is None:
+            solver.bake_slopes()
         self.irradiance, self.reflection = solver.forward(self.light)
         self.weight = solver.weights(solver.model(self.irradiance, self.reflection)) * solver.fitted
         self.evidence = solver.evidence(self.weight)
         self.before = 0.0
-        self._fit_points()
+        self.gloss = self._fit_gloss(self.light, self.irradiance, self.reflection)
+        self.highlights = self._highlights(self.gloss, self.reflection)
+        self._fit_points(self.highlights)
         self.skin = self._skin_pull()
 
-    def _fit_points(self) -> None:
+    def _fit_gloss(self, light: np.ndarray, irradiance: torch.Tensor, reflection: torch.Tensor) -> GlossFit | None:
+        """Intensity and roughness for a light, once highlights count."""
+        if not self.solver.trust_highlights:
+            return None
+        slope = self.solver.forward_slope(light, irradiance) if self.seeks_roughness else None
+        return GlossFit(self.solver, irradiance, reflection, slope, self.weight, self.evidence)
+
+    def _highlights(self, gloss: GlossFit | None, reflection: torch.Tensor) -> torch.Tensor:
+        return self.solver.state.specular * reflection if gloss is None else gloss.highlights
+
+    def _fit_points(self, highlights: torch.Tensor) -> None:
         solver = self.solver
-        self.albedo = solver.eliminate(self.irradiance, self.reflection, self.weight)
+        self.albedo = solver.eliminate(self.irradiance, highlights, self.weight)
         solver.state.albedo = self.albedo[..., 0].T.double().numpy()
-        self.pure = solver.off_albedo(self.reflection, self.irradiance, self.weight)
+
+    @property
+    def radiance(self) -> torch.Tensor:
+        """The model [3, P, F] that is linearised, all that is eliminated at its best."""
+        return self.albedo * self.irradiance + self.highlights
 
     def _skin_pull(self) -> SkinPull | None:
         """The prior on skin near the present albedo; points count as far as the samples determine them."""
@@ -85,11 +110,18 @@ class LightStep:
         return self.solver.skin_prior.at(_log_of(self.albedo), known.double().numpy())
 
     def settle(self) -> float:
-        """Specular intensity, the light's scale and the albedo for the present light, weights as they were -> by how
-        much the scale changed at most, in the logarithm."""
+        """Roughness, specular intensity, the light's scale and the albedo for the present light, weights as they were
+        -> by how much the scale changed at most, in the logarithm; while the roughness moves the scale waits, and the
+        roughness's change is returned."""
         solver, settings = self.solver, self.solver.settings
         self.irradiance, self.reflection = solver.forward(solver.state.light)
-        self._fit_points()
+        roughened = self._roughen()
+        if roughened > _SETTLED:
+            gloss = GlossFit(solver, self.irradiance, self.reflection, None, self.weight, self.evidence)
+            solver.state.specular = max(float(gloss.best[0]), 0.0)
+            self._fit_points(gloss.highlights)
+            return roughened
+        self._fit_points(solver.state.specular * self.reflection)
         log_albedo, log_irradiance, _ = solver.mean_on_skin(self.albedo, self.irradiance)
         highlights = None
         if solver.trust_highlights:
@@ -106,70 +138,75 @@ class LightStep:
         solver.state.params = self.model.scaled(solver.state.params, log_factor)
         solver.state.specular = specular if settings.specular else 0.0
         self.irradiance, self.reflection = self.irradiance * factor, self.reflection * factor
-        self._fit_points()
+        self._fit_points(solver.state.specular * self.reflection)
         return float(np.abs(log_factor).max())
 
-    def cost(self, params: np.ndarray) -> float:
-        """Data and priors with albedo and, once highlights count, specular intensity eliminated; weights held."""
+    def _roughen(self) -> float:
+        """Moves the roughness, where it is sought, to where highlights in the present light have it -> by how much."""
         solver = self.solver
-        irradiance, reflection = solver.forward(self.model.radiance(params))
-        specular, unlikely = solver.state.specular, 0.0
-        if solver.trust_highlights:
-            mean, precision = self._specular_prior()
-            specular = solver.highlights(irradiance, reflection, self.weight).most_likely(mean, precision)
-            unlikely = 0.5 * precision * (specular - mean) ** 2
-        albedo = solver.eliminate(irradiance, reflection, self.weight, specular)
-        model = albedo * irradiance + specular * reflection
-        data = 0.5 * self.evidence * float((self.weight * (model - solver.colours).square()).sum())
-        return data + unlikely + self.unlikely_skin(albedo) + self.model.prior(params, solver.settings.priors)[0]
+        if not self.seeks_roughness:
+            return 0.0
+        change = self._fit_gloss(solver.state.light, self.irradiance, self.reflection).change_of_roughness
+        solver.roughen(change)
+        self.irradiance, self.reflection = solver.forward(solver.state.light)
+        return abs(change)
+
+    def cost(self, params: np.ndarray) -> float:
+        """Data and priors with albedo and, once highlights count, gloss eliminated; weights held."""
+        return self._judge(params)[0]
+
+    def _judge(self, params: np.ndarray) -> tuple[float, float]:
+        """That, and the change of the log roughness with which it is reached."""
+        solver, light = self.solver, self.model.radiance(params)
+        irradiance, reflection = solver.forward(light)
+        gloss = self._fit_gloss(light, irradiance, reflection)
+        highlights = self._highlights(gloss, reflection)
+        albedo = solver.eliminate(irradiance, highlights, self.weight)
+        error = albedo * irradiance + highlights - solver.colours
+        data = 0.5 * self.evidence * float((self.weight * error.square()).sum())
+        known = self.unlikely_skin(albedo) + self.model.prior(params, solver.settings.priors)[0]
+        return (data + known, 0.0) if gloss is None else (data + known + gloss.unlikely, gloss.change_of_roughness)
 
     def unlikely_skin(self, albedo: torch.Tensor) -> float:
         """What the prior on skin costs for an albedo [3, P, 1]."""
         return 0.0 if self.skin is None else self.skin.cost(_log_of(albedo))
-
-    def _specular_prior(self) -> tuple[float, float]:
-        """Mean and precision of the specular intensity."""
-        mean, sigma = self.solver.settings.specular_prior
-        return mean, (mean * sigma) ** -2
 
     def _render(self, change: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
         """Change of the model [3, P, F] with the parameters [M, 3], and of it what is out of the eliminated unknowns'
         reach."""
         solver = self.solver
         along = torch.from_numpy(solver.frame_light.along(self.model.tangent(solver.state.params, change)))
-        result = self.albedo * torch.bmm(solver.baked, along.permute(2, 0, 1).contiguous())
+        result = self.albedo * per_channel(solver.baked, along.permute(2, 0, 1))
         if solver.settings.specular:
-            result += solver.state.specular * solver.reflect(along)
-        whole, result = result, solver.off_albedo(result, self.irradiance, self.weight)
-        if solver.trust_highlights:
-            weighted = self.weight * self.pure
-            known = (weighted * self.pure).sum() + self._specular_prior()[1] / self.evidence
-            result -= self.pure * ((weighted * result).sum() / known)
-        return whole, result
+            result += solver.state.specular * reflect(solver.lobes, along)
+        pure = solver.off_albedo(result, self.irradiance, self.weight)
+        return result, pure if self.gloss is None else self.gloss.off(pure)
 
     def _pull_of_skin(self, log_albedo: np.ndarray) -> torch.Tensor:
         """Derivative [3, P, F] of the prior on skin at log_albedo [3, P] by the model, whose rise the albedo that is
         fitted to it turns into a fall of its own."""
         return self.per_albedo * torch.from_numpy(-self.skin(log_albedo)).float()[..., None]
 
-    def _adjoint(self, values: torch.Tensor) -> np.ndarray:
-        """Transpose of the unprojected rendering: [3, P, F] -> [M, 3]."""
+    def _adjoint(self, values: torch.Tensor, specular: float, slope: float = 0.0) -> np.ndarray:
+        """Transpose of the unprojected rendering, with highlights specular S + slope S': [3, P, F] -> [M, 3]."""
         solver = self.solver
-        along = torch.bmm(solver.baked.transpose(1, 2), self.albedo * values).permute(1, 2, 0)
+        along = per_channel_transposed(solver.baked, self.albedo * values).permute(1, 2, 0)
         if solver.settings.specular:
-            along = along + solver.state.specular * solver.reflect_adjoint(values)
+            along = along + specular * reflect_transposed(solver.lobes, values)
+        if slope:
+            along = along + slope * reflect_transposed(solver.slopes, values)
         return self.model.adjoint(solver.state.params, solver.frame_light.adjoint(along.contiguous().numpy()))
 
     def gradient(self) -> np.ndarray:
         """[M, 3] derivative of cost by the parameters."""
         solver, state = self.solver, self.solver.state
-        error = self.albedo * self.irradiance + state.specular * self.reflection - solver.colours
-        values = self.evidence * self.weight * error
+        values = self.evidence * self.weight * (self.radiance - solver.colours)
         if self.skin is not None:
             values = values + self._pull_of_skin(_log_of(self.albedo))
-        data = self._adjoint(values)
+        gloss = (state.specular,) if self.gloss is None else (
+            float(self.gloss.best[0]), state.specular * self.gloss.change_of_roughness)
         _, prior, self.prior_product = self.model.prior(state.params, solver.settings.priors)
-        return data + prior
+        return self._adjoint(values, *gloss) + prior
 
     def product(self, change: np.ndarray) -> np.ndarray:
         """Gauss-Newton Hessian times a change [M, 3]."""
@@ -178,7 +215,7 @@ class LightStep:
         if self.skin is not None:
             fall = -(self.per_albedo * whole).sum(2)
             values = values + self._pull_of_skin(fall.double().numpy())
-        return self._adjoint(values) + self.prior_product(change)
+        return self._adjoint(values, self.solver.state.specular) + self.prior_product(change)
 
     def take(self) -> None:
         """Moves the solver's light at constant mean irradiance per channel; halved until the cost falls.
@@ -212,9 +249,11 @@ class LightStep:
             steps = [level(np.clip(whole, -_LARGEST_FALL, _LARGEST_RISE)), whole / longest]
         self.before = self.cost(state.params)
         for halving in 0.5 ** np.arange(6):
-            costs = [self.cost(state.params + halving * step) for step in steps]
-            if min(costs) < self.before:
-                state.params = state.params + halving * steps[int(np.argmin(costs))]
+            costs, changes = zip(*(self._judge(state.params + halving * step) for step in steps), strict=True)
+            best = int(np.argmin(costs))
+            if costs[best] < self.before:
+                shorter = min(1.0, LARGEST_ROUGHENING / max(abs(changes[best]), 1e-9))
+                state.params = state.params + shorter * halving * steps[best]
                 break
 
 

@@ -18,9 +18,8 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from shared.solve.appearance import AppearanceSolver
+from shared.solve.appearance import ROUGHNESS_RANGE, AppearanceSolver
 
-ROUGHNESS_RANGE = (0.1, 0.7)
 FACTOR, STEPS = 1.18, 2
 """Ratio of neighbouring roughnesses that are tried, and how many to each side."""
 WIDTH_MM, REACH = 8.0, 3.0
@@ -98,7 +97,7 @@ def local_roughness(solver: AppearanceSolver) -> tuple[GlossEquations | None, di
     for name, tried in (("one", state.roughness), ("local", local)):
         solver.bake_lobes(tried)
         shown = solver.forward(state.light)[1] * specular
-        albedo = solver.eliminate(irradiance, shown, weight, 1.0)
+        albedo = solver.eliminate(irradiance, shown, weight)
         held_out = weight * (1.0 - solver.fitted)
         squared = held_out * (albedo * irradiance + shown - solver.colours).square()
         errors[name] = float((squared.sum() / held_out.sum().clamp_min(1e-9)).sqrt())

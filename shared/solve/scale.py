@@ -55,16 +55,6 @@ class Highlights:
     precision: np.ndarray
     diffuse_share: np.ndarray
 
-    @property
-    def pooled(self) -> float:
-        """The one intensity that fits all channels best."""
-        return float((self.intensity * self.precision).sum() / max(self.precision.sum(), 1e-12))
-
-    def most_likely(self, mean: float, precision: float) -> float:
-        """That one under a normal prior of this mean and precision; not negative."""
-        moment = (self.intensity * self.precision).sum() + precision * mean
-        return max(float(moment / (self.precision.sum() + precision)), 0.0)
-
 
 @dataclass(frozen=True)
 class SkinLocus:
