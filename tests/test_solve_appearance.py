@@ -132,3 +132,14 @@ def test_the_fit_is_deterministic(matte):
     first, second = (fit_appearance(capture, settings).state for _ in range(2))
     assert np.array_equal(first.params, second.params)
     assert np.array_equal(first.albedo, second.albedo)
+
+
+def test_a_roughness_at_the_end_of_its_range_does_not_keep_the_scale_waiting(truth, monkeypatch):
+    """Of lobes narrower than may be: the scale settles all the same."""
+    from shared.solve import appearance as module
+
+    monkeypatch.setattr(module, "ROUGHNESS_RANGE", (0.48, 0.7))
+    found = fit_appearance(truth[0], Settings(resolutions=(8,), steps=12, noise=(0.003, 0.01), roughness=0.55))
+    assert found.state.roughness == pytest.approx(0.48)
+    assert found.state.specular != Settings().specular_prior[0]
+    assert min(record["rescaled"] for record in found.iterations[SHAPING_STEPS:]) < 0.03

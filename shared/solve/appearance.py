@@ -282,11 +282,13 @@ class AppearanceSolver(SampleErrors):
         median = np.median(self.state.albedo[self.capture.skin], axis=0)
         return torch.from_numpy(median.astype(np.float32))[:, None, None]
 
-    def roughen(self, change: float) -> None:
-        """Changes the log roughness, at most by what lobes may be linearised over, and bakes what follows from it."""
-        change = float(np.clip(change, -LARGEST_ROUGHENING, LARGEST_ROUGHENING))
-        self.state.roughness = float(np.clip(self.state.roughness * np.exp(change), *ROUGHNESS_RANGE))
+    def roughen(self, change: float) -> float:
+        """Changes the log roughness, within its range and at most by what lobes may be linearised over, and bakes what
+        follows from it -> by how much it was changed."""
+        change, before = np.clip(change, -LARGEST_ROUGHENING, LARGEST_ROUGHENING), self.state.roughness
+        self.state.roughness = float(np.clip(before * np.exp(change), *ROUGHNESS_RANGE))
         self.bake_lobes()
+        return abs(float(np.log(self.state.roughness / before)))
 
     def highlights(self, irradiance, reflection, weight) -> Highlights:
         """What the samples say about the specular intensity, per channel, with albedo eliminated."""

@@ -174,8 +174,10 @@ def _linearised(solver: AppearanceSolver) -> LightStep:
     for _ in range(_ROUGHNESS_STEPS):
         if step.gloss is None or abs(step.gloss.change_of_roughness) < LARGEST_ROUGHENING:
             break
-        solver.roughen(step.gloss.change_of_roughness)
+        roughened = solver.roughen(step.gloss.change_of_roughness)
         step = LightStep(solver)
+        if roughened < LARGEST_ROUGHENING:  # as far as its range goes
+            break
     return step
 
 

@@ -147,9 +147,9 @@ class LightStep:
         if not self.seeks_roughness:
             return 0.0
         change = self._fit_gloss(solver.state.light, self.irradiance, self.reflection).change_of_roughness
-        solver.roughen(change)
+        roughened = solver.roughen(change)
         self.irradiance, self.reflection = solver.forward(solver.state.light)
-        return abs(change)
+        return roughened
 
     def cost(self, params: np.ndarray) -> float:
         """Data and priors with albedo and, once highlights count, gloss eliminated; weights held."""
