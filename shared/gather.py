@@ -180,9 +180,10 @@ def satisfied(limits, error):
     return ((limits > 0) & (error >= 0)) | ((limits < 0) & (error <= 0))
 
 
-def sample_limits(picture: Picture, pixels: np.ndarray) -> np.ndarray:
-    """[N, 2] -> int8 [N, 3]: +1 or -1 where a pixel that the sample reads is clipped or crushed."""
-    found = remap(picture.limits.astype(np.float32), pixels, cv2.INTER_LINEAR)
+def sample_limits(limits: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """A picture's limits as float32 [H, W, 3] at pixels [N, 2] -> int8 [N, 3]: +1 or -1 where a pixel that the sample
+    reads is clipped or crushed."""
+    found = remap(limits, pixels, cv2.INTER_LINEAR)
     return (found > 0.1).astype(np.int8) - (found < -0.5).astype(np.int8)
 
 
@@ -209,7 +210,7 @@ def gather_samples(
         seen = np.nonzero(view.weight[index] > 0)[0]
         pixels = view.pixels[index[seen]]
         colours[seen, f] = sample_colours(picture, pixels)
-        limits[seen, f] = sample_limits(picture, pixels)
+        limits[seen, f] = sample_limits(picture.limits.astype(np.float32), pixels)
         weight[seen, f] = view.weight[index[seen]] * sample_inside(picture, pixels)
     return Samples(colours, weight, limits, towards)
 

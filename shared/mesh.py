@@ -6,10 +6,13 @@ Computing vertex normals from polygonal facets, 1998 (weights by angle).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sparse
+
+from shared.compiled import compiled
 
 
 @dataclass(frozen=True)
@@ -154,42 +157,33 @@ def rasterize_uv(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray]:
 
     Row 0 is v = 1. Where faces overlap in UV the one listed first wins.
     """
-    corners = mesh.uvs[mesh.face_uvs] * [size, -size] + [0.0, size]
+    corners = np.ascontiguousarray(mesh.uvs[mesh.face_uvs] * [size, -size] + [0.0, size], float)
     face = np.full((size, size), -1, np.int32)
     bary = np.zeros((size, size, 3), np.float32)
-    low = np.clip(np.ceil(corners.min(1) - 0.5), 0, size).astype(int)
-    high = np.clip(np.floor(corners.max(1) - 0.5) + 1, 0, size).astype(int)
-    extent = np.maximum(high - low, 0)
-    for extent_group in np.unique(extent, axis=0):
-        if extent_group.min() == 0:
-            continue
-        members = np.nonzero((extent == extent_group).all(1))[0]
-        for chunk in np.array_split(members, 1 + len(members) * int(extent_group.prod()) // 2_000_000):
-            _rasterize_group(corners[chunk], low[chunk], extent_group, chunk, face, bary)
+    _rasterize(corners, face, bary)
     return face, bary
 
 
-def _rasterize_group(corners, low, extent, indices, face, bary) -> None:
-    """Fills face and bary for triangles whose bounding boxes all have the same extent in texels."""
-    x, y = np.meshgrid(np.arange(extent[0]), np.arange(extent[1]))
-    column, row = low[:, 0, None] + x.ravel(), low[:, 1, None] + y.ravel()
-    p = np.stack([column + 0.5, row + 0.5], axis=-1)
-    a, b, c = corners[:, None, 0], corners[:, None, 1], corners[:, None, 2]
-    area = _cross(b - a, c - a)
-    area = np.where(np.abs(area) < 1e-12, np.inf, area)
-    weights = np.stack([_cross(c - b, p - b), _cross(a - c, p - c), _cross(b - a, p - a)], axis=-1) / area[..., None]
-    inside = (weights >= -1e-6).all(-1)
-    which = np.broadcast_to(indices[:, None], inside.shape)[inside]
-    row, column, weights = row[inside], column[inside], weights[inside]
-    order = np.argsort(-which, kind="stable")
-    which, row, column, weights = which[order], row[order], column[order], weights[order]
-    free = (face[row, column] < 0) | (face[row, column] > which)
-    row, column, which, weights = row[free], column[free], which[free], weights[free]
-    face[row, column] = which
-    kept = face[row, column] == which
-    weights = np.clip(weights[kept], 0.0, 1.0)
-    bary[row[kept], column[kept]] = weights / weights.sum(1, keepdims=True)
+@compiled
+def _rasterize(corners, face, bary):
+    """corners [faces, 3, 2] in texels -> filled in: face [S, S], bary [S, S, 3]."""
+    size = len(face)
+    for f in range(len(corners)):
+        (ax, ay), (bx, by), (cx, cy) = corners[f]
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if abs(area) < 1e-12:
+            continue
+        for row in range(max(0, math.ceil(min(ay, by, cy) - 0.5)), min(size, math.floor(max(ay, by, cy) + 0.5))):
+            y = row + 0.5
+            for column in range(max(0, math.ceil(min(ax, bx, cx) - 0.5)), min(size, math.floor(max(ax, bx, cx) + 0.5))):
+                x = column + 0.5
+                u = ((cx - bx) * (y - by) - (cy - by) * (x - bx)) / area
+                v = ((ax - cx) * (y - cy) - (ay - cy) * (x - cx)) / area
+                w = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / area
+                if face[row, column] >= 0 or min(u, v, w) < -1e-6:
+                    continue
+                u, v, w = max(u, 0.0), max(v, 0.0), max(w, 0.0)
+                face[row, column] = f
+                total = u + v + w
+                bary[row, column, 0], bary[row, column, 1], bary[row, column, 2] = u / total, v / total, w / total
 
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

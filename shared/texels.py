@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
-import torch
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse.linalg import splu
 
+from shared.compiled import compiled
 from shared.gather import Picture, View, sample_colours, sample_inside, sample_limits, texel_size
 from shared.mesh import Mesh, rasterize_uv, vertex_adjacency
+
+_BLOCK = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,22 @@ class TexelSamples:
     limits: np.ndarray
 
 
+@dataclass(frozen=True)
+class FrameView:
+    """A frame before it is sampled: rows [n] of the texels that it shows, table [V, 4 + C] of what is linear on the
+    surface (pixel times depth, depth, weight, C values of the caller's), the picture and its limits as float32."""
+
+    rows: np.ndarray
+    table: np.ndarray
+    picture: Picture
+    limits: np.ndarray
+    focal_length: np.float32
+
+    def blocks(self) -> list[np.ndarray]:
+        """The rows, cut where what a block needs no longer fits the processor's cache."""
+        return [self.rows[start : start + _BLOCK] for start in range(0, len(self.rows), _BLOCK)]
+
+
 class TexelSurface:
     """The T texels of a size x size map that lie on the mesh: face [T], bary [T, 3]."""
 
@@ -33,8 +52,8 @@ class TexelSurface:
         # Faces without area in the layout give no corner weights.
         self.pixel = np.nonzero((face >= 0).ravel() & np.isfinite(bary).all(-1).ravel())[0]
         self.face, self.bary = face.ravel()[self.pixel], bary.reshape(-1, 3)[self.pixel]
-        self._corners = torch.from_numpy(np.ascontiguousarray(mesh.faces[self.face], np.int32))
-        self._corner_weights = torch.from_numpy(np.ascontiguousarray(self.bary, np.float32))
+        self._corners = np.ascontiguousarray(mesh.faces[self.face], np.int32)
+        self._corner_weights = np.ascontiguousarray(self.bary, np.float32)
         self._texel_mm = texel_size(mesh, size).astype(np.float32)[self.face]
 
     def __len__(self) -> int:
@@ -44,12 +63,12 @@ class TexelSurface:
         """Median edge of a texel on the surface, mm."""
         return float(np.median(self._texel_mm))
 
-    def interpolate(self, values: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Vertex values [V, C] at some texels -> [n, C] float32."""
-        table = torch.from_numpy(np.ascontiguousarray(values, np.float32))
-        chosen = rows if isinstance(rows, slice) else torch.from_numpy(rows)
-        corners, weights = self._corners[chosen], self._corner_weights[chosen]
-        return torch.nn.functional.embedding_bag(corners, table, per_sample_weights=weights, mode="sum").numpy()
+    def interpolate(self, values: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Vertex values [V, C] at some texels, None: at all -> [n, C] float32."""
+        rows = np.arange(len(self)) if rows is None else rows
+        found = np.empty((len(rows), values.shape[1]), np.float32)
+        _interpolate(self._corners, self._corner_weights, rows, np.ascontiguousarray(values, np.float32), found)
+        return found
 
     def to_image(self, values: np.ndarray, elsewhere: float = 0.0) -> np.ndarray:
         """[T, ...] -> [size, size, ...]."""
@@ -59,42 +78,50 @@ class TexelSurface:
 
     def dilated(self, image: np.ndarray) -> np.ndarray:
         """The gutters around the charts take the nearest texel's value, so that filtering never reads background."""
-        empty = np.ones((self.size, self.size), bool)
-        empty.ravel()[self.pixel] = False
-        if not empty.any():
-            return image
-        rows, columns = distance_transform_edt(empty, return_distances=False, return_indices=True)
-        return image[rows, columns]
+        empty, nearest = self._gutters
+        filled = image.copy()
+        filled.reshape((-1,) + image.shape[2:])[empty] = image.reshape((-1,) + image.shape[2:])[nearest]
+        return filled
 
-    def samples(
-        self, view: View, picture: Picture, intrinsics: np.ndarray, shade: np.ndarray | None = None
-    ) -> tuple[TexelSamples, np.ndarray]:
-        """What one frame shows of the texels; a face counts as seen when all its corners are.
+    @cached_property
+    def _gutters(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places in the image where nothing lies, and of each the nearest one where something does."""
+        background = np.ones((self.size, self.size), bool)
+        background.ravel()[self.pixel] = False
+        empty = np.nonzero(background.ravel())[0]
+        if len(empty) == 0:
+            return empty, empty
+        rows, columns = distance_transform_edt(background, return_distances=False, return_indices=True)
+        return empty, rows.ravel()[empty] * np.int64(self.size) + columns.ravel()[empty]
 
-        shade [V, C]: vertex values to interpolate on the way -> samples, and shade at them [n, C] (C = 0 without).
-        """
+    def view(
+        self, view: View, picture: Picture, intrinsics: np.ndarray, values: np.ndarray | None = None
+    ) -> FrameView:
+        """What one frame shows; a face counts as seen when all its corners are. values [V, C]: to interpolate at the
+        samples."""
         seen_face = (view.weight > 0)[self.mesh.faces].all(1)
-        rows = np.nonzero(seen_face[self.face])[0]
         # Depth times pixel is linear on the surface; the pixel itself is not.
         depth = view.depth[:, None]
-        columns = [view.pixels * depth, depth, view.weight[:, None]] + ([] if shade is None else [shade])
-        found = self.interpolate(np.concatenate(columns, axis=1), rows)
-        pixels = found[:, :2] / found[:, 2:3]
-        footprint = self._texel_mm[rows] * np.float32(intrinsics[0, 0]) / found[:, 2]
-        weight = found[:, 3] * sample_inside(picture, pixels)
-        colours = sample_colours(picture, pixels, footprint)
-        return TexelSamples(rows, colours, weight, sample_limits(picture, pixels)), found[:, 4:]
+        columns = [view.pixels * depth, depth, view.weight[:, None]] + ([] if values is None else [values])
+        table = np.concatenate(columns, axis=1, dtype=np.float32, casting="same_kind")
+        rows, limits = np.nonzero(seen_face[self.face])[0], picture.limits.astype(np.float32)
+        return FrameView(rows, table, picture, limits, np.float32(intrinsics[0, 0]))
+
+    def samples(self, frame: FrameView, rows: np.ndarray | None = None) -> tuple[TexelSamples, np.ndarray]:
+        """What the frame shows of some of its rows [n], None: of all -> samples, and its values at them [n, C]."""
+        rows = frame.rows if rows is None else rows
+        found = self.interpolate(frame.table, rows)
+        pixels, footprint = np.empty((len(rows), 2), np.float32), np.empty(len(rows), np.float32)
+        _project(found, self._texel_mm, rows, frame.focal_length, pixels, footprint)
+        weight = found[:, 3] * sample_inside(frame.picture, pixels)
+        colours = sample_colours(frame.picture, pixels, footprint)
+        return TexelSamples(rows, colours, weight, sample_limits(frame.limits, pixels)), found[:, 4:]
 
     def to_vertices(self, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Weighted means of texel values [T, C, ...] around each vertex; weight [T, C] -> means [V, C, ...] and total
-        weights [V, C]."""
-        shape = (len(self.mesh.vertices), len(self))
-        entries = self.mesh.faces[self.face].ravel(), np.repeat(np.arange(len(self)), 3)
-        gather = sparse.csr_matrix((self.bary.ravel(), entries), shape)
-        total = gather @ weight
-        spread = weight.reshape(weight.shape + (1,) * (values.ndim - 2))
-        sums = (gather @ (spread * values).reshape(len(self), -1)).reshape(shape[:1] + values.shape[1:])
-        return sums / np.maximum(total, 1e-12).reshape(total.shape + (1,) * (values.ndim - 2)), total
+        """Weighted means of texel values [T, C] around each vertex; weight [T, C] -> means and total weights [V, C]."""
+        sums, total = np.zeros((2, len(self.mesh.vertices), values.shape[1]))
+        _scatter(self._corners, self._corner_weights, values, weight, sums, total)
+        return sums / np.maximum(total, 1e-12), total
 
 
 def smooth_field(
@@ -126,3 +153,31 @@ def smooth_field(
         solved = splu((prior + sparse.diags(known)).tocsc()).solve(right)
         result[:, c] = solved.reshape(result[:, c].shape)
     return result
+
+
+@compiled
+def _interpolate(corners, weights, rows, table, found):
+    for i in range(len(rows)):
+        a, b, c = corners[rows[i]]
+        u, v, w = weights[rows[i]]
+        for k in range(table.shape[1]):
+            found[i, k] = u * table[a, k] + v * table[b, k] + w * table[c, k]
+
+
+@compiled
+def _project(found, texel_mm, rows, focal_length, pixels, footprint):
+    for i in range(len(rows)):
+        nearness = np.float32(1.0) / found[i, 2]
+        pixels[i, 0], pixels[i, 1] = found[i, 0] * nearness, found[i, 1] * nearness
+        footprint[i] = texel_mm[rows[i]] * focal_length * nearness
+
+
+@compiled
+def _scatter(corners, weights, values, trust, sums, total):
+    for t in range(len(corners)):
+        for k in range(3):
+            vertex, share = corners[t, k], weights[t, k]
+            for c in range(values.shape[1]):
+                part = np.float64(share) * trust[t, c]
+                total[vertex, c] += part
+                sums[vertex, c] += part * values[t, c]

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import torch
 
+Result = TypeVar("Result")
 
-def share_out(count: int, work: Callable[[int], object]) -> None:
-    """Does work(0) to work(count - 1), on as many threads as torch may use."""
+
+def share_out(count: int, work: Callable[[int], Result]) -> list[Result]:
+    """Does work(0) to work(count - 1), on as many threads as torch may use -> what they return, in order."""
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        list(pool.map(work, range(count)))
+        return list(pool.map(work, range(count)))

@@ -10,7 +10,15 @@ from shared.envmap import cube_directions
 from shared.gather import SurfaceViewer, prepare_picture
 from shared.mesh import interpolate, vertex_normals
 from shared.raycast import RayScene, camera_hits
-from shared.solve.normal_map import NormalPass, ReliefEquations, normal_image, uv_tangents
+from shared.solve.normal_map import (
+    LinearSamples,
+    NormalPass,
+    ReliefEquations,
+    ReliefSums,
+    most_likely_turns,
+    normal_image,
+    uv_tangents,
+)
 from shared.solve.texture import TexelMaterial
 from shared.solve.texture_pass import Clip
 from shared.texels import TexelSurface
@@ -18,37 +26,20 @@ from shared.texels import TexelSurface
 FRAMES, WAVE_MM, HEIGHT_MM = 16, 18.0, 0.4
 
 
-class Plain:
-    """A pass whose frames are given: no pooling, no pictures."""
-
-    accumulate, solve = NormalPass.accumulate, NormalPass.solve
-
-    def __init__(self, frames):
-        self.frames, self.surface = frames, range(frames[0][1].shape[0])
-
-    def progress(self, items, label):
-        return items
-
-    def frame(self, f):
-        return self.frames[f]
-
-    def _pooled(self, values, pool):
-        return values
-
-
 def test_turn_is_least_squares_with_the_albedo_eliminated():
     rng = np.random.default_rng(0)
     frames = [
-        (np.arange(5), *(rng.normal(size=shape).astype(np.float32) for shape in ((5, 3), (5, 3, 2), (5, 3))),
-         rng.uniform(0.2, 1.0, (5, 3)).astype(np.float32))
+        (*(rng.normal(size=shape).astype(np.float32) for shape in ((5, 3), (5, 3, 2))),
+         0.05 * rng.normal(size=(5, 3)).astype(np.float32), rng.uniform(0.2, 1.0, (5, 3)).astype(np.float32))
         for _ in range(6)
     ]
-    small = [(rows, e, d, 0.05 * r, w) for rows, e, d, r, w in frames]
-    plain = Plain(small)
-    found = plain.solve(plain.accumulate(np.arange(6)), 0.0, 1e6)
+    sums = ReliefSums(5)
+    for e, d, r, w in frames:
+        sums.add(LinearSamples(np.arange(5), e, r, np.ones_like(e), d, w), r)
+    found = most_likely_turns(sums.equations(), 1e6)
     for t in range(5):
         design, right = np.zeros((6, 3, 5)), np.zeros((6, 3))
-        for f, (_, e, d, r, w) in enumerate(small):
+        for f, (e, d, r, w) in enumerate(frames):
             root = np.sqrt(w[t])
             design[f, [0, 1, 2], [2, 3, 4]] = root * e[t]
             design[f, :, :2] = root[:, None] * d[t]

@@ -257,7 +257,8 @@ def test_clipped_and_crushed_channels_are_marked():
     codes = np.full((64, 64, 3), 128, np.uint8)
     codes[10:20, 10:20, 0] = 255
     codes[40:50, 40:50, 2] = 0
-    found = sample_limits(flat_picture(64, 64, codes=codes), np.array([[15.0, 15.0], [45.0, 45.0], [30.0, 30.0]]))
+    limits = flat_picture(64, 64, codes=codes).limits.astype(np.float32)
+    found = sample_limits(limits, np.array([[15.0, 15.0], [45.0, 45.0], [30.0, 30.0]]))
     assert found.tolist() == [[1, 0, 0], [0, 0, -1], [0, 0, 0]]
     codes16 = (codes.astype(np.uint16) * 257).astype(np.uint16)
     linear = np.zeros((64, 64, 3), np.float32)

@@ -16,17 +16,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.ndimage import gaussian_filter
 
+from shared.compiled import compiled
 from shared.gather import SurfaceViewer
 from shared.mesh import Mesh, normalised, vertex_adjacency
+from shared.read_ahead import read_ahead
 from shared.shading import VertexShading
 from shared.solve.capture import spread_frames
 from shared.solve.shape_terms import IrradianceVectors, Reflections
 from shared.solve.texture import CORRELATED_FRAMES, Noise, TexelMaterial, robust_weight
 from shared.solve.texture_pass import Clip
-from shared.texels import TexelSurface
+from shared.texels import FrameView, TexelSurface
+from shared.threads import share_out
 
 FRAMES = 32
 RESOLVED_PX, WIDTH_OF_DEVIATION = 2.0, 2.355
@@ -73,6 +75,42 @@ class ReliefEquations:
         return share, -share * (slope + 0.5 * share * curvature)
 
 
+@dataclass(frozen=True)
+class LinearSamples:
+    """Samples of one frame at the texels rows [n]: E, residuals, the model's scale and the weights [n, 3], derivatives
+    of the residuals by the turn [n, 3, 2]."""
+
+    rows: np.ndarray
+    irradiance: np.ndarray
+    error: np.ndarray
+    scale: np.ndarray
+    derivative: np.ndarray
+    weight: np.ndarray
+
+
+class ReliefSums:
+    """Sums over frames of weighted products of E, the derivatives d1, d2 by the turn, and the residual r, for T texels.
+
+    per_channel [T, 12]: EE, E d1, E d2, E r, three channels each; together [T, 5]: d1 d1, d1 d2, d2 d2, d1 r, d2 r.
+    """
+
+    def __init__(self, texels: int):
+        self.per_channel, self.together = np.zeros((texels, 12), np.float32), np.zeros((texels, 5), np.float32)
+
+    def add(self, samples: LinearSamples, residual: np.ndarray) -> None:
+        """Samples with the residuals [n, 3] to explain."""
+        seen = samples.rows, samples.irradiance, samples.derivative, residual, samples.weight
+        _add_products(*seen, self.per_channel, self.together)
+
+    def equations(self) -> ReliefEquations:
+        """With the albedo eliminated."""
+        ee, e1, e2, er = (self.per_channel[:, 3 * k : 3 * k + 3] for k in range(4))
+        ee = np.maximum(ee, 1e-6)
+        products = [(left * right / ee).sum(1) for left, right in ((e1, e1), (e1, e2), (e2, e2), (e1, er), (e2, er))]
+        left = self.together - np.stack(products, axis=1)
+        return ReliefEquations(left[:, :3], left[:, 3:])
+
+
 class NormalPass:
     """Per-texel normals under a fixed light, reflectance and mesh. material: the texels', from the texture pass."""
 
@@ -101,9 +139,9 @@ class NormalPass:
         """Turns [T, 2], tangents of angles towards growing u and v, and a record. pool: standard width over which
         texels count together, in texels."""
         fitted, held_out = (np.nonzero(chosen)[0] for chosen in (self.clip.fitted, ~self.clip.fitted))
-        equations = self.accumulate(fitted[spread_frames(len(fitted), FRAMES)])
+        equations = self.pooled(self.accumulate(fitted[spread_frames(len(fitted), FRAMES)]), pool)
         unseen = self.accumulate(held_out[spread_frames(len(held_out), FRAMES // 4)])
-        turns = [self.solve(equations, pool, prior) for prior in PRIORS]
+        turns = [most_likely_turns(equations, prior) for prior in PRIORS]
         shares, gains = zip(*(unseen.confirmed(turn) for turn in turns), strict=True)
         best = int(np.argmax(gains))
         turn = turns[best] * np.float32(shares[best])
@@ -114,71 +152,113 @@ class NormalPass:
 
     def accumulate(self, frames: np.ndarray) -> ReliefEquations:
         """The equations of some frames."""
-        count = len(self.surface)
-        per_channel = np.zeros((count, 12), np.float32)  # EE, E d1, E d2, E r, three channels each
-        together = np.zeros((count, 5), np.float32)  # d1 d1, d1 d2, d2 d2, d1 r, d2 r
-        for f in self.progress(frames, "fine normals"):
-            rows, e, d, r, w = self.frame(int(f))
-            share = [w * e * e, w * e * d[..., 0], w * e * d[..., 1], w * e * r]
-            products = [d[..., 0] ** 2, d[..., 0] * d[..., 1], d[..., 1] ** 2, d[..., 0] * r, d[..., 1] * r]
-            at = torch.from_numpy(rows)
-            for sums, parts in (
-                (per_channel, np.concatenate(share, axis=1)),
-                (together, np.stack([(w * product).sum(1) for product in products], axis=1)),
-            ):
-                torch.from_numpy(sums).index_add_(0, at, torch.from_numpy(parts.astype(np.float32)))
-        ee, e1, e2, er = (per_channel[:, 3 * k : 3 * k + 3] for k in range(4))
-        ee = np.maximum(ee, 1e-6)
-        hessian = together[:, :3] - np.stack([(e1 * e1 / ee).sum(1), (e1 * e2 / ee).sum(1), (e2 * e2 / ee).sum(1)], 1)
-        gradient = together[:, 3:] - np.stack([(e1 * er / ee).sum(1), (e2 * er / ee).sum(1)], axis=1)
-        return ReliefEquations(hessian, gradient)
+        sums = ReliefSums(len(self.surface))
+        for view in read_ahead(map(self.view, self.progress(frames, "fine normals"))):
+            self._add(view, sums)
+        return sums.equations()
 
-    def frame(self, f: int) -> tuple[np.ndarray, ...]:
-        """Rows [n], E [n, 3], derivatives by the turn [n, 3, 2], residuals [n, 3] and weights [n, 3] of one frame."""
-        clip, shading, material = self.clip, self.shading, self.material
+    def view(self, f: int) -> FrameView:
+        """One frame with E, S [3] and their derivatives by the normal [3, 3] of each vertex, 24 values."""
+        clip, shading = self.clip, self.shading
         pose, picture, lens = clip.camera_from_head[f], clip.picture(f), self.intrinsics[f]
         view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
         slope = self.vectors.frames(slice(f, f + 1))[:, 0]
         gloss, gloss_slope = self.reflections.at(f, shading.points.normals)
         of_points = np.concatenate([gloss, slope.reshape(-1, 9), gloss_slope.reshape(-1, 9)], axis=1)
         values = np.concatenate([shading.irradiance(f), of_points[shading.stand_in]], axis=1)
-        samples, found = self.surface.samples(view, picture, lens, values)
-        rows = samples.rows
-        e, s = found[:, :3], found[:, 3:6]
-        intensity, albedo = material.specular[rows, None], material.albedo[rows]
-        model = albedo * e + intensity * s
-        turning = albedo[..., None] * found[:, 6:15].reshape(-1, 3, 3)
-        turning += intensity[..., None] * found[:, 15:].reshape(-1, 3, 3)
-        derivative = np.einsum("ncx,nkx->nck", turning, self.tangents[rows])
-        robust = robust_weight(model, samples, self.noise, material.information[rows])
+        return self.surface.view(view, picture, lens, values)
+
+    def _add(self, view: FrameView, sums: ReliefSums) -> None:
+        blocks = view.blocks()
+        linear = share_out(len(blocks), lambda k: self._linearised(view, blocks[k]))
+        common = self._common(linear)
+
+        def add(k: int) -> None:
+            coarse = linear[k].scale * self.surface.interpolate(common, linear[k].rows)
+            sums.add(linear[k], linear[k].error - coarse)
+
+        share_out(len(blocks), add)
+
+    def _linearised(self, view: FrameView, rows: np.ndarray) -> LinearSamples:
+        samples, found = self.surface.samples(view, rows)
+        material, shape = self.material, (len(rows), 3)
+        model, derivative = np.empty(shape, np.float32), np.empty(shape + (2,), np.float32)
+        _linearise(rows, found, material.albedo, material.specular, self.tangents, model, derivative)
+        robust = robust_weight(model, samples, self.noise, material.information)
         weight = samples.weight[:, None] * self.noise.precision(samples.colours) * robust
-        return rows, e, derivative, self._fine(model - samples.colours, model, weight, rows), weight
+        scale = np.maximum(model, np.float32(1e-3))
+        return LinearSamples(rows, found[:, :3], model - samples.colours, scale, derivative, weight)
 
-    def _fine(self, error: np.ndarray, model: np.ndarray, weight: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """The residuals [n, 3] without what the vertices' neighbourhoods share, relative to the model."""
-        scale, corner, count = np.maximum(model, 1e-3), self.corner[rows], len(self.surface.mesh.vertices)
-        total, mean = np.zeros((count, 3)), np.zeros((count, 3))
+    def _common(self, parts: list[LinearSamples]) -> np.ndarray:
+        """[V, 3]: the residual that the neighbourhood of a vertex shares in a frame, relative to the model."""
+        total, sums = np.zeros((2, len(self.surface.mesh.vertices), 3))
+        for part in parts:
+            _add_to_corners(self.corner[part.rows], part.weight, part.scale, part.error, total, sums)
+        return (self.around @ sums) / np.maximum(self.around @ total, 1e-9)
+
+    def pooled(self, equations: ReliefEquations, pool: float) -> ReliefEquations:
+        """Each texel's equations with its neighbours', as a Gaussian of standard width pool weighs them, and errors of
+        neighbouring frames taken together."""
+
+        def blurred(values: np.ndarray) -> np.ndarray:
+            image = self.surface.to_image(values / np.float32(CORRELATED_FRAMES))
+            return gaussian_filter(image, pool, mode="constant").ravel()[self.surface.pixel]
+
+        parts = (equations.hessian, equations.gradient)
+        return ReliefEquations(*(np.stack([blurred(column) for column in part.T], axis=1) for part in parts))
+
+
+def most_likely_turns(equations: ReliefEquations, prior: float) -> np.ndarray:
+    """[T, 2] float32 under a standard deviation of prior radians."""
+    (a11, a12, a22), (b1, b2) = equations.hessian.T, equations.gradient.T
+    p11, p22 = a11 + prior**-2, a22 + prior**-2
+    determinant = p11 * p22 - a12 * a12
+    turn = np.stack([a12 * b2 - p22 * b1, a12 * b1 - p11 * b2], axis=1) / determinant[:, None]
+    length = np.linalg.norm(turn, axis=1, keepdims=True)
+    turn *= np.minimum(1.0, LARGEST_TURN / np.maximum(length, 1e-9))
+    return turn.astype(np.float32)
+
+
+@compiled
+def _linearise(rows, values, albedo, specular, tangents, model, derivative):
+    """values [n, 24]: E, S, and by the normal dE, dS -> model [n, 3] and its derivative by the turn [n, 3, 2]."""
+    for i in range(len(rows)):
+        row = rows[i]
         for c in range(3):
-            trust = weight[:, c] * scale[:, c] ** 2
-            total[:, c] = np.bincount(corner, trust, count)
-            mean[:, c] = np.bincount(corner, trust * error[:, c] / scale[:, c], count)
-        mean = (self.around @ mean) / np.maximum(self.around @ total, 1e-9)
-        return error - scale * self.surface.interpolate(mean, rows)
+            a, s = albedo[row, c], specular[row]
+            model[i, c] = a * values[i, c] + s * values[i, 3 + c]
+            derivative[i, c, 0] = derivative[i, c, 1] = 0.0
+            for x in range(3):
+                slope = a * values[i, 6 + 3 * c + x] + s * values[i, 15 + 3 * c + x]
+                derivative[i, c, 0] += slope * tangents[row, 0, x]
+                derivative[i, c, 1] += slope * tangents[row, 1, x]
 
-    def solve(self, equations: ReliefEquations, pool: float, prior: float) -> np.ndarray:
-        """The most likely turns [T, 2] float32 under a standard deviation of prior radians."""
-        pooled = [self._pooled(x, pool) / CORRELATED_FRAMES for x in (*equations.hessian.T, *equations.gradient.T)]
-        a11, a12, a22, b1, b2 = pooled
-        p11, p22 = a11 + prior**-2, a22 + prior**-2
-        determinant = p11 * p22 - a12 * a12
-        turn = np.stack([a12 * b2 - p22 * b1, a12 * b1 - p11 * b2], axis=1) / determinant[:, None]
-        length = np.linalg.norm(turn, axis=1, keepdims=True)
-        turn *= np.minimum(1.0, LARGEST_TURN / np.maximum(length, 1e-9))
-        return turn.astype(np.float32)
 
-    def _pooled(self, values: np.ndarray, pool: float) -> np.ndarray:
-        image = gaussian_filter(self.surface.to_image(values), pool, mode="constant")
-        return image.ravel()[self.surface.pixel]
+@compiled
+def _add_to_corners(corner, weight, scale, error, total, sums):
+    for i in range(len(corner)):
+        for c in range(3):
+            trust = weight[i, c] * scale[i, c]
+            total[corner[i], c] += trust * scale[i, c]
+            sums[corner[i], c] += trust * error[i, c]
+
+
+@compiled
+def _add_products(rows, irradiance, derivative, error, weight, per_channel, together):
+    for i in range(len(rows)):
+        row = rows[i]
+        for c in range(3):
+            e, w, r = irradiance[i, c], weight[i, c], error[i, c]
+            d1, d2 = derivative[i, c]
+            per_channel[row, c] += w * e * e
+            per_channel[row, 3 + c] += w * e * d1
+            per_channel[row, 6 + c] += w * e * d2
+            per_channel[row, 9 + c] += w * e * r
+            together[row, 0] += w * d1 * d1
+            together[row, 1] += w * d1 * d2
+            together[row, 2] += w * d2 * d2
+            together[row, 3] += w * d1 * r
+            together[row, 4] += w * d2 * r
 
 
 def resolved_texels(surface: TexelSurface, clip: Clip) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -24,7 +25,10 @@ from shared.solve.texture import (
     robust_weight,
     weigh_lights,
 )
-from shared.texels import TexelSamples, TexelSurface, smooth_field
+from shared.texels import FrameView, TexelSamples, TexelSurface, smooth_field
+from shared.threads import share_out
+
+Result = TypeVar("Result")
 
 _ALBEDO_PULL = 10.0
 NEIGHBOUR_STEP, SURROUNDINGS_SPREAD = 0.05, 3.0
@@ -43,6 +47,21 @@ class Clip:
     intrinsics: np.ndarray
     fitted: np.ndarray
     light_index: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class LitSamples:
+    """Samples of a frame with E, S and the standard deviation of a typical albedo's radiance by the borders of shadows
+    [n, 3] at them."""
+
+    samples: TexelSamples
+    irradiance: np.ndarray
+    reflection: np.ndarray
+    shadow: np.ndarray
+
+    def model(self, material: TexelMaterial) -> np.ndarray:
+        """The radiance [n, 3] that the material gives them."""
+        return material.radiance(self.samples.rows, self.irradiance, self.reflection)
 
 
 class TexturePass:
@@ -104,39 +123,50 @@ class TexturePass:
     def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> Evidence:
         parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]
         borders = [BorderSums(len(self.surface), self.viewer.error_mm) for _ in self.systematic]
-        ahead = read_ahead(map(self.frame, self.progress(frames, label)))
-        for f, (samples, irradiance, reflection, shadow) in zip(frames, ahead, strict=True):
-            if material is None:
-                robust = (samples.limits == 0).astype(np.float32)
-            else:
-                model = _model(material, samples, irradiance, reflection)
-                robust = robust_weight(model, samples, self.noise, material.information[samples.rows], shadow)
-            parts[self.light_index[f]].add(samples, irradiance, reflection, robust, shadow)
-            borders[self.light_index[f]].add(samples)
+        ahead = read_ahead(map(self.view, self.progress(frames, label)))
+        for f, view in zip(frames, ahead, strict=True):
+            sums = parts[self.light_index[f]], borders[self.light_index[f]]
+            self._share_out(view, lambda lit, sums=sums: self._add(material, *sums, lit))
         for part, trust in zip(parts, self.light_trust, strict=True):
             part.scale(trust)
         systematic = [error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
                       for error, border, part in zip(self.systematic, borders, parts, strict=True)]
         return weigh_lights(parts, systematic, self.typical_albedo)
 
-    def frame(self, f: int) -> tuple[TexelSamples, np.ndarray, np.ndarray, np.ndarray]:
-        """Samples of one frame with E, S and the standard deviation of a typical albedo's radiance by the borders of
-        shadows [n, 3] at them."""
-        clip = self.clip
+    def view(self, f: int) -> FrameView:
+        """One frame with the values that LitSamples takes."""
+        clip, shading = self.clip, self.shading
         pose, picture, lens = clip.camera_from_head[f], clip.picture(f), self.intrinsics[f]
         view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
-        shading = self.shading
         shadow = shading.shadow_doubt(f) * self.typical_albedo.astype(np.float32)
-        shade = np.concatenate([shading.irradiance(f), shading.reflection(f), shadow], axis=1)
-        samples, shade = self.surface.samples(view, picture, lens, shade)
-        return samples, shade[:, :3], shade[:, 3:6], shade[:, 6:]
+        values = np.concatenate([shading.irradiance(f), shading.reflection(f), shadow], axis=1)
+        return self.surface.view(view, picture, lens, values)
+
+    def _share_out(self, view: FrameView, work: Callable[[LitSamples], Result]) -> list[Result]:
+        """work(samples) for each block of the frame's texels, on several threads -> the results in order."""
+        blocks = view.blocks()
+
+        def of_block(k: int) -> Result:
+            samples, found = self.surface.samples(view, blocks[k])
+            return work(LitSamples(samples, found[:, :3], found[:, 3:6], found[:, 6:]))
+
+        return share_out(len(blocks), of_block)
+
+    def _add(self, material: TexelMaterial | None, part: NormalEquations, border: BorderSums, lit: LitSamples) -> None:
+        """A block's samples to its light's sums; without a material every sample that is not at a limit counts."""
+        samples = lit.samples
+        if material is None:
+            robust = (samples.limits == 0).astype(np.float32)
+        else:
+            robust = robust_weight(lit.model(material), samples, self.noise, material.information, lit.shadow)
+        part.add(samples, lit.irradiance, lit.reflection, robust, lit.shadow)
+        border.add(samples)
 
     def _close(self, evidence: Evidence, intensities: list[np.ndarray]) -> list[TexelMaterial]:
         """Albedo for each of some given intensities [T]; channels left open by the samples follow the others and the
         neighbourhood."""
         equations, information, systematic = evidence.equations, evidence.information, evidence.systematic
-        nothing = np.zeros_like(equations.ee)
-        rough = np.stack([equations.solve_albedo(specular, nothing, 1e-6) for specular in intensities], axis=2)
+        rough = [equations.solve_albedo(specular, 0.0, 1e-6) for specular in intensities]
         around = self._surroundings(rough, information).astype(np.float32)
         certain = information / (1.0 + information)
         trusted = (PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + systematic)).mean(1)
@@ -145,51 +175,54 @@ class TexturePass:
         for k, specular in enumerate(intensities):
             smooth = np.exp(self.surface.interpolate(around[..., k]))
             # A texel's brightness by its certain channels, its colour otherwise the neighbourhood's.
-            brighter = (certain * np.log(np.maximum(rough[..., k], 1e-3) / smooth)).sum(1) / (certain.sum(1) + 0.3)
+            brighter = (certain * np.log(np.maximum(rough[k], 1e-3) / smooth)).sum(1) / (certain.sum(1) + 0.3)
             albedo = equations.solve_albedo(specular, smooth * np.exp(brighter * trusted)[:, None], pull)
             found.append(TexelMaterial(albedo, specular, information.min(1)))
         return found
 
-    def _surroundings(self, rough: np.ndarray, information: np.ndarray) -> np.ndarray:
-        """[V, 3, K] log albedo as smooth fields, of K results rough [T, 3, K]: texels that the clip tells little of
-        follow those that it knows.
+    def _surroundings(self, rough: list[np.ndarray], information: np.ndarray) -> np.ndarray:
+        """[V, 3, K] log albedo as smooth fields, of K results [T, 3]: texels that the clip tells little of follow
+        those that it knows.
 
         Brightness and colour are smooth each for itself, both relative to the person's typical skin: a channel that is
         clipped everywhere takes its brightness from the others that are not, its tint from where all are known.
         """
-        typical = np.log(np.maximum(self.typical_albedo, 1e-3))[:, None]
-        relative = np.log(np.maximum(rough, 1e-3)) - typical
+        typical = np.log(np.maximum(self.typical_albedo, 1e-3)).astype(np.float32)
         precision = np.minimum(information, NEIGHBOUR_STEP**-2)
         total = np.maximum(precision.sum(1, keepdims=True), 1e-12)
-        brightness = np.einsum("tc,tck->tk", precision / total, relative)[:, None]
-        tint_precision = precision * (total - precision) / total
-        return typical + self._field(brightness, total) + self._field(relative - brightness, tint_precision)
+        share = precision / total
+        brightness, tint = [], []
+        for albedo in rough:
+            relative = np.log(np.maximum(albedo, 1e-3)) - typical
+            level = (share * relative).sum(1, keepdims=True)
+            brightness.append(self.surface.to_vertices(level, total)[0])
+            tint.append(self.surface.to_vertices(relative - level, precision * (1.0 - share))[0])
+        tint_field = self._field(np.stack(tint, axis=-1), precision * (1.0 - share))
+        return typical[:, None] + self._field(np.stack(brightness, axis=-1), total) + tint_field
 
-    def _field(self, values: np.ndarray, precision: np.ndarray) -> np.ndarray:
-        """Texel values [T, C, K] of some precision [T, C] -> the smooth fields [V, C, K] through them; 0 far from any.
-        """
-        means, total = self.surface.to_vertices(values, precision)
+    def _field(self, means: np.ndarray, precision: np.ndarray) -> np.ndarray:
+        """Vertex values [V, C, K], means of texels of some precision [T, C] -> the smooth fields [V, C, K] through
+        them; 0 far from any."""
         share, _ = self.surface.to_vertices(precision, np.ones_like(precision))
         # What leaves a texel as open as the prior does is mostly a model's error that its neighbours share.
-        known = np.where(total > 0.0, share**2 / (share + PRIOR_SPREAD**-2), 0.0)
+        known = share**2 / (share + PRIOR_SPREAD**-2)
         centre = np.zeros(precision.shape[1])
         return smooth_field(self.surface.mesh, means, known, centre, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD, self.region)
 
     def held_out_errors(self, candidates: list[TexelMaterial]) -> list[float]:
         """Root mean square residual of each candidate on the held-out frames (linear, censored, trust-weighted)."""
-        squared, total = np.zeros(len(candidates)), 0.0
+        sums = np.zeros(1 + len(candidates))
         frames = self.progress(np.nonzero(~self.clip.fitted)[0], "texture, held-out frames")
-        for samples, irradiance, reflection, _ in read_ahead(map(self.frame, frames)):
-            total += 3.0 * float(samples.weight.sum())
-            for k, material in enumerate(candidates):
-                error = _model(material, samples, irradiance, reflection) - samples.colours
-                error[satisfied(samples.limits, error)] = 0.0
-                squared[k] += float((samples.weight[:, None] * np.minimum(error**2, 0.01)).sum())
-        return [float(value) for value in np.sqrt(squared / max(total, 1e-9))]
+        for view in read_ahead(map(self.view, frames)):
+            sums += sum(self._share_out(view, lambda lit: _squared_errors(candidates, lit)))
+        return [float(value) for value in np.sqrt(sums[1:] / max(3.0 * sums[0], 1e-9))]
 
 
-def _model(
-    material: TexelMaterial, samples: TexelSamples, irradiance: np.ndarray, reflection: np.ndarray
-) -> np.ndarray:
-    rows = samples.rows
-    return material.albedo[rows] * irradiance + material.specular[rows, None] * reflection
+def _squared_errors(candidates: list[TexelMaterial], lit: LitSamples) -> np.ndarray:
+    """The samples' total weight and each candidate's sum of squared residuals."""
+    samples, sums = lit.samples, [lit.samples.weight.sum()]
+    for material in candidates:
+        error = lit.model(material) - samples.colours
+        error[satisfied(samples.limits, error)] = 0.0
+        sums.append((samples.weight[:, None] * np.minimum(error**2, 0.01)).sum())
+    return np.array(sums, float)
