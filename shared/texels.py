@@ -49,11 +49,9 @@ class TexelSurface:
     def __init__(self, mesh: Mesh, size: int):
         self.mesh, self.size = mesh, size
         face, bary = rasterize_uv(mesh, size)
-        # Faces without area in the layout give no corner weights.
-        self.pixel = np.nonzero((face >= 0).ravel() & np.isfinite(bary).all(-1).ravel())[0]
+        self.pixel = np.nonzero(face.ravel() >= 0)[0]
         self.face, self.bary = face.ravel()[self.pixel], bary.reshape(-1, 3)[self.pixel]
         self._corners = np.ascontiguousarray(mesh.faces[self.face], np.int32)
-        self._corner_weights = np.ascontiguousarray(self.bary, np.float32)
         self._texel_mm = texel_size(mesh, size).astype(np.float32)[self.face]
 
     def __len__(self) -> int:
@@ -67,7 +65,7 @@ class TexelSurface:
         """Vertex values [V, C] at some texels, None: at all -> [n, C] float32."""
         rows = np.arange(len(self)) if rows is None else rows
         found = np.empty((len(rows), values.shape[1]), np.float32)
-        _interpolate(self._corners, self._corner_weights, rows, np.ascontiguousarray(values, np.float32), found)
+        _interpolate(self._corners, self.bary, rows, np.ascontiguousarray(values, np.float32), found)
         return found
 
     def to_image(self, values: np.ndarray, elsewhere: float = 0.0) -> np.ndarray:
@@ -94,7 +92,7 @@ class TexelSurface:
         rows, columns = distance_transform_edt(background, return_distances=False, return_indices=True)
         return empty, rows.ravel()[empty] * np.int64(self.size) + columns.ravel()[empty]
 
-    def view(
+    def frame_view(
         self, view: View, picture: Picture, intrinsics: np.ndarray, values: np.ndarray | None = None
     ) -> FrameView:
         """What one frame shows; a face counts as seen when all its corners are. values [V, C]: to interpolate at the
@@ -120,7 +118,7 @@ class TexelSurface:
     def to_vertices(self, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Weighted means of texel values [T, C] around each vertex; weight [T, C] -> means and total weights [V, C]."""
         sums, total = np.zeros((2, len(self.mesh.vertices), values.shape[1]))
-        _scatter(self._corners, self._corner_weights, values, weight, sums, total)
+        _scatter(self._corners, self.bary, values, weight, sums, total)
         return sums / np.maximum(total, 1e-12), total
 
 

@@ -47,7 +47,7 @@ def average_frames(job: Job, inputs, surface, viewer) -> tuple:
     pictures = read_ahead(map(inputs.picture, job.progress(chosen, "projecting frames", total=len(chosen))))
     for f, picture in zip(chosen, pictures, strict=True):
         view = viewer.view(inputs.camera_from_head[f], inputs.intrinsics, inputs.size)
-        samples, _ = surface.samples(surface.view(view, picture, inputs.intrinsics))
+        samples, _ = surface.samples(surface.frame_view(view, picture, inputs.intrinsics))
         total[samples.rows] += samples.weight[:, None] * samples.colours
         weight[samples.rows] += samples.weight
     return total / np.maximum(weight, 1e-6)[:, None], weight

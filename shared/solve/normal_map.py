@@ -166,7 +166,7 @@ class NormalPass:
         gloss, gloss_slope = self.reflections.at(f, shading.points.normals)
         of_points = np.concatenate([gloss, slope.reshape(-1, 9), gloss_slope.reshape(-1, 9)], axis=1)
         values = np.concatenate([shading.irradiance(f), of_points[shading.stand_in]], axis=1)
-        return self.surface.view(view, picture, lens, values)
+        return self.surface.frame_view(view, picture, lens, values)
 
     def _add(self, view: FrameView, sums: ReliefSums) -> None:
         blocks = view.blocks()

@@ -50,7 +50,7 @@ def average_texture(inputs, viewer: SurfaceViewer, size: int, frames: np.ndarray
     for f in progress(frames, "mean texture"):
         picture = inputs.picture(f)
         view = viewer.view(inputs.camera_from_head[f], inputs.intrinsics, picture.inside.shape[::-1])
-        samples, _ = surface.samples(surface.view(view, picture, inputs.intrinsics))
+        samples, _ = surface.samples(surface.frame_view(view, picture, inputs.intrinsics))
         total[samples.rows] += samples.weight[:, None] * samples.colours
         weight[samples.rows] += samples.weight
     seen = weight > 1e-3

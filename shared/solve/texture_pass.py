@@ -140,7 +140,7 @@ class TexturePass:
         view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
         shadow = shading.shadow_doubt(f) * self.typical_albedo.astype(np.float32)
         values = np.concatenate([shading.irradiance(f), shading.reflection(f), shadow], axis=1)
-        return self.surface.view(view, picture, lens, values)
+        return self.surface.frame_view(view, picture, lens, values)
 
     def _share_out(self, view: FrameView, work: Callable[[LitSamples], Result]) -> list[Result]:
         """work(samples) for each block of the frame's texels, on several threads -> the results in order."""
