@@ -19,7 +19,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from shared.compiled import compiled
-from shared.gather import BALL_MM
+from shared.gather import BALL_MM, satisfied
 from shared.texels import TexelSamples, TexelSurface
 
 CORRELATED_FRAMES = 6.0
@@ -244,6 +244,9 @@ def robust_weight(
     return weight
 
 
+_satisfied = compiled(satisfied)
+
+
 @compiled
 def _weigh_samples(model, colours, limits, rows, information, shadow, numbers, weight):
     absolute, relative, prior, tightness = numbers
@@ -251,7 +254,7 @@ def _weigh_samples(model, colours, limits, rows, information, shadow, numbers, w
         openness = np.float32(1.0) / (information[rows[i]] + prior)
         for c in range(3):
             error, sigma = model[i, c] - colours[i, c], absolute + relative * colours[i, c]
-            if (limits[i, c] > 0 and error >= 0) or (limits[i, c] < 0 and error <= 0):
+            if _satisfied(limits[i, c], error):
                 weight[i, c] = 0.0
                 continue
             variance = sigma * sigma + model[i, c] * model[i, c] * openness + shadow[i, c] * shadow[i, c]
