@@ -1,23 +1,14 @@
-"""Specular lobe sums, the shading of a mesh in all frames, and samples gathered from pictures."""
+"""Specular lobe sums and the shading of a mesh in all frames."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from quadrature import hemisphere_quadrature
-from shapes import grid_plane, sphere
+from shapes import sphere
 
 from shared.brdf import directional_albedo, specular_cosine
 from shared.envmap import cube_directions, cube_solid_angles
-from shared.gather import (
-    SurfaceViewer,
-    gather_samples,
-    prepare_picture,
-    sample_colours,
-    sample_inside,
-    sample_limits,
-    texel_size,
-)
 from shared.geometry import fibonacci_sphere, rigid, rotation_from_vector
 from shared.lobe_tables import specular_tables
 from shared.lobes import LobeTable, specular_reflection
@@ -222,106 +213,3 @@ def test_key_frames_are_near_each_other_in_turn():
     assert np.diff(turn[keys]).max() <= 0.05 + 1e-9
     assert len(keys) < 40
     assert np.array_equal(key_frames(turn[::20], 0.05), np.arange(6))
-
-
-# ---------------------------------------------------------------------- from pictures to samples
-
-
-def flat_picture(height=120, width=160, codes=None, linear=None):
-    codes = np.full((height, width, 3), 128, np.uint8) if codes is None else codes
-    linear = np.full((height, width, 3), 0.2, np.float32) if linear is None else linear
-    return prepare_picture(codes, linear, np.full((height, width), 255, np.uint8))
-
-
-def test_ramps_are_sampled_at_any_footprint():
-    """Colour u + 2 v: pixel centres at integer + 0.5, and the levels of the pyramid agree to 0.07 pixels (OpenCV's
-    bicubic kernel bends ramps by that much)."""
-    v, u = np.mgrid[0:128, 0:160] + 0.5
-    picture = flat_picture(128, 160, linear=np.stack([u + 2 * v] * 3, axis=-1).astype(np.float32))
-    assert len(picture.levels) > 1
-    pixels = np.random.default_rng(0).uniform(30, 98, (50, 2))
-    expected = pixels[:, 0] + 2 * pixels[:, 1]
-    for footprint in (None, np.full(50, 0.5), np.full(50, 1.5), np.full(50, 2.0), np.full(50, 3.0)):
-        assert np.allclose(sample_colours(picture, pixels, footprint)[:, 1], expected, atol=0.2)
-
-
-def test_wide_footprints_average():
-    stripes = np.tile(np.array([0.0, 1.0], np.float32), 80)[None, :, None] * np.ones((128, 1, 3), np.float32)
-    picture = flat_picture(128, 160, linear=stripes)
-    pixels = np.array([[64.5, 50.5], [65.5, 50.5]])
-    assert np.allclose(sample_colours(picture, pixels)[:, 0], [0.0, 1.0], atol=1e-6)
-    assert np.allclose(sample_colours(picture, pixels, np.full(2, 2.0)), 0.5, atol=1e-6)
-
-
-def test_clipped_and_crushed_channels_are_marked():
-    codes = np.full((64, 64, 3), 128, np.uint8)
-    codes[10:20, 10:20, 0] = 255
-    codes[40:50, 40:50, 2] = 0
-    limits = flat_picture(64, 64, codes=codes).limits.astype(np.float32)
-    found = sample_limits(limits, np.array([[15.0, 15.0], [45.0, 45.0], [30.0, 30.0]]))
-    assert found.tolist() == [[1, 0, 0], [0, 0, -1], [0, 0, 0]]
-    codes16 = (codes.astype(np.uint16) * 257).astype(np.uint16)
-    linear = np.zeros((64, 64, 3), np.float32)
-    assert np.array_equal(prepare_picture(codes16, linear, codes[..., 0]).limits, flat_picture(64, 64, codes).limits)
-
-
-def test_trust_fades_towards_the_mask():
-    mask = np.zeros((64, 64), np.uint8)
-    mask[:, 20:] = 128
-    picture = prepare_picture(np.full((64, 64, 3), 99, np.uint8), np.zeros((64, 64, 3), np.float32), mask)
-    trust = sample_inside(picture, np.array([[10.5, 30.5], [20.5, 30.5], [22.5, 30.5], [40.5, 30.5]]))
-    assert trust[0] == 0.0 and trust[1] < trust[2] < trust[3] == 1.0
-
-
-def test_the_camera_sees_the_front_of_a_ball():
-    ball = sphere(40.0, 4)
-    viewer = SurfaceViewer.of(ball)
-    pose = nods(np.array([0.0]), distance=400.0)[0]
-    view = viewer.view(pose, LENS, (160, 120))
-    towards = normalised(np.array([0, 0, 400.0]) - ball.vertices)
-    assert np.allclose(view.towards_camera, towards)
-    cosine = (towards * ball.vertices).sum(1) / 40.0
-    assert np.allclose(view.cosine, cosine, atol=0.02)
-    assert (view.weight[cosine < 0.15] == 0).all()
-    assert np.allclose(view.weight[cosine > 0.4], view.cosine[cosine > 0.4] ** 2)
-    assert np.allclose(view.depth, 400.0 - ball.vertices[:, 2])
-
-
-def test_what_lies_behind_an_edge_is_left_out_with_a_margin():
-    """A plate 50 mm before a wall hides part of it; wall vertices next to its shadow are not trusted either."""
-    wall, plate = grid_plane(41, 80.0), grid_plane(9, 30.0)
-    vertices = np.concatenate([wall.vertices, plate.vertices + [0, 0, 50.0]])
-    faces = np.concatenate([wall.faces, plate.faces + len(wall.vertices)])
-    mesh = wall.replace(vertices=vertices, faces=faces)
-    viewer = SurfaceViewer(mesh, RayScene(vertices, faces), margin_mm=4.0)
-    view = viewer.view(rigid(FACING, np.array([0, 0, 450.0])), LENS, (160, 120))
-    reach = np.abs(wall.vertices[:, :2]).max(1)
-    shadow = 15.0 * 450.0 / 400.0
-    on_wall = view.weight[: len(wall.vertices)]
-    assert (on_wall[reach < shadow + 1.5] == 0).all()
-    in_picture = reach < 38.0
-    assert (on_wall[in_picture & (reach > shadow + 12.0)] > 0.9).all()
-    assert (view.weight[len(wall.vertices) :] > 0.9).all()
-
-
-def test_samples_are_the_colours_behind_the_vertices():
-    """The picture shows each pixel's own coordinates, so samples must equal the projections."""
-    ball = sphere(40.0, 3)
-    viewer = SurfaceViewer.of(ball)
-    v, u = np.mgrid[0:120, 0:160] + 0.5
-    picture = flat_picture(linear=np.stack([u, v, 0 * u + 1], axis=-1).astype(np.float32))
-    poses = nods(np.array([0.0, 25.0]), distance=450.0)
-    index = np.nonzero(np.abs(ball.vertices[:, 1]) < 20)[0][::2]
-    samples = gather_samples(viewer, index, [picture, picture], poses, LENS)
-    for f in range(2):
-        in_camera = ball.vertices[index] @ poses[f, :3, :3].T + poses[f, :3, 3]
-        pixels = 300.0 * in_camera[:, :2] / in_camera[:, 2:] + [80, 60]
-        seen = samples.weight[:, f] > 0
-        assert 0.3 < seen.mean() < 0.6
-        assert np.allclose(samples.colours[seen, f, :2], pixels[seen], atol=0.05)
-        assert (samples.colours[~seen, f] == 0).all()
-    assert np.array_equal(samples.frames(np.array([1])).points(np.arange(3)).colours, samples.colours[:3, 1:])
-
-
-def test_texels_of_a_square_are_squares():
-    assert np.allclose(texel_size(grid_plane(5, 64.0), 128), 0.5)
