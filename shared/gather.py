@@ -181,9 +181,9 @@ def satisfied(limits, error):
 
 
 def sample_limits(limits: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """A picture's limits as float32 [H, W, 3] at pixels [N, 2] -> int8 [N, 3]: +1 or -1 where a pixel that the sample
-    reads is clipped or crushed."""
-    found = remap(limits, pixels, cv2.INTER_LINEAR)
+    """A picture's limits [H, W, 3] at pixels [N, 2] -> int8 [N, 3]: +1 or -1 where a pixel that the sample reads is
+    clipped or crushed. Limits as float32 need not be converted."""
+    found = remap(limits.astype(np.float32, copy=False), pixels, cv2.INTER_LINEAR)
     return (found > 0.1).astype(np.int8) - (found < -0.5).astype(np.int8)
 
 
@@ -210,7 +210,7 @@ def gather_samples(
         seen = np.nonzero(view.weight[index] > 0)[0]
         pixels = view.pixels[index[seen]]
         colours[seen, f] = sample_colours(picture, pixels)
-        limits[seen, f] = sample_limits(picture.limits.astype(np.float32), pixels)
+        limits[seen, f] = sample_limits(picture.limits, pixels)
         weight[seen, f] = view.weight[index[seen]] * sample_inside(picture, pixels)
     return Samples(colours, weight, limits, towards)
 

@@ -186,4 +186,3 @@ def _rasterize(corners, face, bary):
                 face[row, column] = f
                 total = u + v + w
                 bary[row, column, 0], bary[row, column, 1], bary[row, column, 2] = u / total, v / total, w / total
-

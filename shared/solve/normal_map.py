@@ -181,9 +181,9 @@ class NormalPass:
 
     def _linearised(self, view: FrameView, rows: np.ndarray) -> LinearSamples:
         samples, found = self.surface.samples(view, rows)
-        material, shape = self.material, (len(rows), 3)
-        model, derivative = np.empty(shape, np.float32), np.empty(shape + (2,), np.float32)
-        _linearise(rows, found, material.albedo, material.specular, self.tangents, model, derivative)
+        material, derivative = self.material, np.empty((len(rows), 3, 2), np.float32)
+        model = material.radiance(rows, found[:, :3], found[:, 3:6])
+        _differentiate(rows, found, material.albedo, material.specular, self.tangents, derivative)
         robust = robust_weight(model, samples, self.noise, material.information)
         weight = samples.weight[:, None] * self.noise.precision(samples.colours) * robust
         scale = np.maximum(model, np.float32(1e-3))
@@ -220,13 +220,12 @@ def most_likely_turns(equations: ReliefEquations, prior: float) -> np.ndarray:
 
 
 @compiled
-def _linearise(rows, values, albedo, specular, tangents, model, derivative):
-    """values [n, 24]: E, S, and by the normal dE, dS -> model [n, 3] and its derivative by the turn [n, 3, 2]."""
+def _differentiate(rows, values, albedo, specular, tangents, derivative):
+    """values [n, 24]: E, S, and by the normal dE, dS -> derivative of the model by the turn [n, 3, 2]."""
     for i in range(len(rows)):
         row = rows[i]
         for c in range(3):
             a, s = albedo[row, c], specular[row]
-            model[i, c] = a * values[i, c] + s * values[i, 3 + c]
             derivative[i, c, 0] = derivative[i, c, 1] = 0.0
             for x in range(3):
                 slope = a * values[i, 6 + 3 * c + x] + s * values[i, 15 + 3 * c + x]

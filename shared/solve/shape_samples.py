@@ -104,6 +104,6 @@ def gather_surface(
         colours[seen, f] = np.maximum(remap(image, pixels), 0.0)
         gradient[seen, f] = np.stack([remap(along_x, pixels), remap(along_y, pixels)], axis=-1)
         slope[seen, f] = projection_slope(points, pose, lens)
-        limits[seen, f] = sample_limits(view.picture.limits.astype(np.float32), pixels)
+        limits[seen, f] = sample_limits(view.picture.limits, pixels)
         weight[seen, f] = view.weight[seen] * sample_inside(view.picture, pixels)
     return SurfaceSamples(colours, gradient, slope, weight, limits)
