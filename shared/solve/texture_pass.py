@@ -191,13 +191,14 @@ class TexturePass:
         precision = np.minimum(information, NEIGHBOUR_STEP**-2)
         total = np.maximum(precision.sum(1, keepdims=True), 1e-12)
         share = precision / total
+        tint_precision = precision * (1.0 - share)
         brightness, tint = [], []
         for albedo in rough:
             relative = np.log(np.maximum(albedo, 1e-3)) - typical
             level = (share * relative).sum(1, keepdims=True)
             brightness.append(self.surface.to_vertices(level, total)[0])
-            tint.append(self.surface.to_vertices(relative - level, precision * (1.0 - share))[0])
-        tint_field = self._field(np.stack(tint, axis=-1), precision * (1.0 - share))
+            tint.append(self.surface.to_vertices(relative - level, tint_precision)[0])
+        tint_field = self._field(np.stack(tint, axis=-1), tint_precision)
         return typical[:, None] + self._field(np.stack(brightness, axis=-1), total) + tint_field
 
     def _field(self, means: np.ndarray, precision: np.ndarray) -> np.ndarray:
