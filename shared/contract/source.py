@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import marshal
 import sys
 from pathlib import Path
+from types import CodeType
 
 from shared.contract.declare import Stage
 from shared.errors import InputError, LimnError
-
-_DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def read_declaration(path: Path) -> Stage:
@@ -48,15 +48,17 @@ def loaded_code(folder: Path) -> dict[str, str]:
 
 
 def fingerprint(path: Path) -> str:
-    """SHA-256 of the file's code without comments, layout and docstrings.
+    """SHA-256 of the file's byte code: without comments, layout, docstrings and assertions.
 
     Advisory: a stage runs again when its version changes, not when this does; planning points out the difference.
     """
-    tree = ast.parse(path.read_bytes())
-    for node in ast.walk(tree):
-        if isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
-            del node.body[0]
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+    code = compile(path.read_bytes(), "", "exec", dont_inherit=True, optimize=2)
+    return hashlib.sha256(marshal.dumps(_without_lines(code), 2)).hexdigest()  # 2: the last without shared references
+
+
+def _without_lines(code: CodeType) -> CodeType:
+    constants = tuple(_without_lines(part) if isinstance(part, CodeType) else part for part in code.co_consts)
+    return code.replace(co_consts=constants, co_firstlineno=0, co_linetable=b"")
 
 
 def _targets(node: ast.stmt) -> list[ast.Name]:
