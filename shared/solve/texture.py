@@ -35,6 +35,12 @@ In a cavity that gets a tenth of the light it leaves the albedo open by a third.
 NORMAL_ERROR = 0.05
 """Error of a normal in radians: what a refined mesh still lacks. Where light grazes the skin it passes for albedo."""
 
+HIGHLIGHT_ERROR = 0.1
+"""Error of a modelled highlight, relative to itself."""
+
+LEAST_MATTE_SHARE = 0.05
+"""Of what a texel sends out, where its modelled highlights leave less or nothing."""
+
 LEAST_BORDER_MM = 0.5
 """Error of where the head's outline lies, however well its surface is known."""
 
@@ -136,6 +142,13 @@ class NormalEquations:
         """[T, 3] of the log albedo, since borders of shadows may lie elsewhere: in all frames the same mesh casts
         them. typical_albedo [3]: what the samples' variance was reckoned with."""
         return self.shadow / np.maximum(self.ee * np.square(typical_albedo), 1e-9)
+
+    def highlight_variance(self, specular: float) -> np.ndarray:
+        """[T, 3] of the log albedo, since highlights of intensity `specular` are wrong by HIGHLIGHT_ERROR of
+        themselves: little where they are a small share of what a texel sends out, all of it in hair that the model
+        gives a skin's gloss."""
+        share = specular * self.es / np.maximum(self.ei, 1e-9)
+        return np.square(HIGHLIGHT_ERROR * share / np.maximum(1.0 - share, LEAST_MATTE_SHARE))
 
     def _bounded_albedo(self, typical_albedo: np.ndarray) -> np.ndarray:
         return np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)

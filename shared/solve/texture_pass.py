@@ -130,6 +130,7 @@ class TexturePass:
         for part, trust in zip(parts, self.light_trust, strict=True):
             part.scale(trust)
         systematic = [error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
+                      + part.highlight_variance(self.specular)
                       for error, border, part in zip(self.systematic, borders, parts, strict=True)]
         return weigh_lights(parts, systematic, self.typical_albedo)
 
