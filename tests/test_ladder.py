@@ -220,7 +220,7 @@ def climb_meshes(monkeypatch, qualities, **settings):
     def reshape(tracked, frames, known, appearance, sizes, shape, progress, note, begun):
         asked.append((shape.subdivisions, begun and begun.mesh))
         return SimpleNamespace(**{**vars(tracked), "capture": noisy(capture, qualities[1 + shape.subdivisions]),
-                                  "mesh": f"level {shape.subdivisions}"})
+                                  "mesh": f"level {shape.subdivisions}", "stopped": 3 + shape.subdivisions})
 
     monkeypatch.setattr(ladder_clip, "SmallClip", Seen)
     monkeypatch.setattr(ladder_clip, "reshape", reshape)
@@ -234,7 +234,7 @@ def test_the_mesh_is_refined_as_far_as_it_serves(one_thread, monkeypatch):
     climbed, asked = climb_meshes(monkeypatch, (0.02, 0.005, 0.02))
     assert climbed.inputs.mesh == "level 0" and climbed.settings.shape is None
     assert asked == [(0, None), (1, "level 0")]  # the second goes on where the first ended
-    assert climbed.shape_record["refined"]
+    assert climbed.shape_record["refined"] and climbed.shape_record["stopped_vertices"] == 3
     assert climbed.shape_record["held_out"]["after"] < 0.5 * climbed.shape_record["held_out"]["before"]
     meshes = [(rung["rung"], rung["climbed"]) for rung in climbed.rungs if rung["part"] == "geometry"]
     assert meshes == [("refined", True), ("subdivided_1", False)]

@@ -119,7 +119,8 @@ class _Climber:
         if self.small is not self.tracked:
             after = self.ladder.present
             residuals = {"before": float(before.errors.mean()), "after": float(after.errors.mean())}
-            self.shape_record = {"refined": True, "held_out": residuals}
+            stopped = self.small.inputs.stopped
+            self.shape_record = {"refined": True, "held_out": residuals, "stopped_vertices": stopped}
             self.ladder.climb()
 
     def _climb_gloss(self) -> None:

@@ -53,7 +53,7 @@ def solve_light(
         scenery_then = set_scenery(viewer_then, settings.sizes, settings.appearance.visibility)
         more = viewer_then, scenery_then, fitted, chart, progress, note, solution
         then, capture_then = _fit_light(reshaped, settings, *more)
-        tracked, shape_record = solution, judge_shape(solution, then)
+        tracked, shape_record = solution, judge_shape(solution, then) | {"stopped_vertices": reshaped.stopped}
         note(f"refined mesh: {shape_record}")
         if shape_record["refined"]:
             inputs, viewer, scenery = reshaped, viewer_then, scenery_then

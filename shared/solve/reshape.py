@@ -26,10 +26,11 @@ TRACK_FLOOR_MM = 0.1
 
 
 class Reshaped:
-    """A clip's inputs with another mesh in the place of theirs; traced: what was looked up to refine it."""
+    """A clip's inputs with another mesh in the place of theirs; traced: what was looked up to refine it; stopped:
+    vertices that moved less than wanted, since the surface would have cut itself."""
 
-    def __init__(self, inputs, mesh: Mesh, traced: Traced | None = None):
-        self._inputs, self.mesh, self.traced = inputs, mesh, traced
+    def __init__(self, inputs, mesh: Mesh, traced: Traced | None = None, stopped: int = 0):
+        self._inputs, self.mesh, self.traced, self.stopped = inputs, mesh, traced, stopped
         self.face_segment = segments_of(inputs, mesh)
 
     def __getattr__(self, name: str):
@@ -118,7 +119,7 @@ def reshape(
     so_far = None if begun is None else (begun.mesh, begun.traced)
     start, refined, traced = solver.refine(inputs.mesh, faces_of(inputs, SHAPED), faces_of(inputs, HELD), so_far)
     placed = move_without_crossing(start.vertices, refined.vertices, refined.faces)
-    undone = (np.abs(placed - refined.vertices).max(1) > 1e-6).sum()
-    if undone:
-        note(f"shape: {undone} vertices moved less than wanted, so that the surface does not cut itself")
-    return Reshaped(inputs, refined.replace(vertices=placed), traced and traced.kept())
+    stopped = int((np.abs(placed - refined.vertices).max(1) > 1e-6).sum())
+    if stopped:
+        note(f"shape: {stopped} vertices moved less than wanted, so that the surface does not cut itself")
+    return Reshaped(inputs, refined.replace(vertices=placed), traced and traced.kept(), stopped)

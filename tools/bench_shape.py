@@ -1,0 +1,96 @@
+"""Measures the refined shape against a subject's truth, for several lambda of the large steps.
+
+    python -m tools.bench_shape SUBJECT RUN [--smoothness 1 5 19 50 200] [--set key=value] [--out shape.csv]
+
+SUBJECT: a folder with gt/; RUN: a run's folder whose work/ holds sample_frames and track_landmarks. The first row is the
+tracked mesh, unrefined. distance: of the true face to the surface after a similarity. normals: where frames see the
+face, of the mesh alone, without its normal map. stopped: vertices that moved less than wanted, since the surface would
+have cut itself. cuts: edges that pass through a face.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from pathlib import Path
+
+import numpy as np
+
+from shared.intersections import crossing_edges
+from shared.io.arrays import load_arrays
+from shared.io.clip_inputs import ClipInputs
+from shared.mesh import Mesh
+from shared.solve.inverse import solve_clip
+from tools.bench_appearance import open_clip, settings_of, silent
+from tools.score import Result, camera_intrinsics, score_appearance, score_geometry
+
+SMOOTHNESS = (1.0, 5.0, 19.0, 50.0, 200.0)
+COLUMNS = ("smoothness", "distance_median_mm", "distance_p95_mm", "normal_median_deg", "normal_p95_deg", "stopped",
+           "cuts", "held_out_residual", "seconds")
+SCORED_FRAMES = 12
+
+
+def shape_errors(subject: Path, clip: ClipInputs, mesh: Mesh) -> dict[str, float]:
+    """Distances in mm and angles in degrees of a mesh in the clip's head space to the true face."""
+    truth, frames = load_arrays(subject / "gt" / "poses.npz"), clip.frame_index
+    rng = np.random.default_rng(0)
+    poses = clip.camera_from_head
+    alignment, scores = score_geometry(subject, mesh, truth["camera_from_head"][frames], poses, rng)
+    known = np.intersect1d(truth["gt_frames"], frames)
+    chosen = known[np.unique(np.linspace(0, len(known) - 1, min(SCORED_FRAMES, len(known))).astype(int))]
+    placed = dict(zip(frames.tolist(), poses, strict=True))
+    result = Result(subject, mesh, {}, placed, camera_intrinsics(subject))
+    normals = score_appearance(subject, result, chosen.tolist(), alignment.rotation, rng)["normal_deg"]
+    distance = scores["geometry_mm"]
+    return {
+        "distance_median_mm": distance["median"],
+        "distance_p95_mm": distance["p95"],
+        "normal_median_deg": normals["median"],
+        "normal_p95_deg": normals["p95"],
+        "cuts": len(crossing_edges(mesh.vertices, mesh.faces)),
+    }
+
+
+def refined(subject: Path, clip: ClipInputs, smoothness: float, given: dict) -> dict:
+    """A row of the table: the clip solved with that lambda, maps as small as they can be."""
+    settings = settings_of({"map_size": 64, "normal_map": False, **given, "shape_smoothness": smoothness})
+    begun = time.perf_counter()
+    result = solve_clip(clip, settings, silent, lambda text: None)
+    seconds = time.perf_counter() - begun
+    stopped, residual = result.record["shape"]["stopped_vertices"], result.solution.held_out
+    return {"smoothness": smoothness, **shape_errors(subject, clip, result.viewer.mesh), "stopped": stopped,
+            "held_out_residual": residual, "seconds": seconds}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("subject", type=Path)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--smoothness", nargs="*", type=float, default=SMOOTHNESS, metavar="LAMBDA")
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="parameters for every row")
+    parser.add_argument("--out", type=Path, help="the table as CSV")
+    options = parser.parse_args(arguments)
+    clip, given = open_clip(options.subject, options.run, True)[0], dict(text.split("=", 1) for text in options.set)
+    rows = [{"smoothness": "tracked", **shape_errors(options.subject, clip, clip.mesh)}]
+    print(" ".join(f"{name:>19s}" for name in COLUMNS))
+    _show(rows[0])
+    for smoothness in options.smoothness:
+        rows.append(refined(options.subject, clip, smoothness, given))
+        _show(rows[-1])
+    if options.out:
+        with options.out.open("w", newline="", encoding="utf-8") as file:
+            table = csv.DictWriter(file, COLUMNS, restval="")
+            table.writeheader()
+            table.writerows(rows)
+    return 0
+
+
+def _show(row: dict) -> None:
+    cells = (row.get(name, "") for name in COLUMNS)
+    print(" ".join(f"{cell:19.4f}" if isinstance(cell, float) else f"{cell!s:>19s}" for cell in cells), flush=True)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
