@@ -76,7 +76,7 @@ STAGE = Stage(
         Parameter("bounce", bool, True, "Count light that bounces between parts of the head."),
         Parameter("specular", bool, True, "Model specular reflection."),
         Parameter("roughness", float, 0.45, "Roughness to start from.", "", 0.1, 0.7),
-        Parameter("search_roughness", bool, True, "Fit the roughness; else it stays at its start."),
+        Parameter("fit_roughness", bool, True, "Fit the roughness; else it stays at its start."),
         Parameter("local_roughness", bool, True, "Let roughness vary over the skin where held-out frames gain by it."),
         Parameter("specular_prior", float, 0.7, "Expected specular intensity of skin; index of refraction 1.4: 0.7.",
                   "", 0.01, 2.0),

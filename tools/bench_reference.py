@@ -43,11 +43,11 @@ FIXED_SHAPE = {"shape": False, "local_roughness": False, "normal_map": False}
 TRANSFER_SIZES: dict[str, dict] = {
     "tiny": {
         "points": 200, "directions": 128, "bounce_nodes": 50, "light_resolution": 4, "light_frames": 6,
-        "light_steps": 2, "map_size": 64, "search_roughness": False, **FIXED_SHAPE,
+        "light_steps": 2, "map_size": 64, "fit_roughness": False, **FIXED_SHAPE,
     },
     "least": {
         "points": 300, "directions": 192, "bounce_nodes": 100, "light_resolution": 8, "light_frames": 10,
-        "light_steps": 4, "map_size": 128, "search_roughness": False, **FIXED_SHAPE,
+        "light_steps": 4, "map_size": 128, "fit_roughness": False, **FIXED_SHAPE,
     },
     "small": {
         "points": 800, "directions": 384, "bounce_nodes": 250, "light_resolution": 8, "light_frames": 16,

@@ -60,7 +60,7 @@ class Settings:
     bounce: bool = True
     specular: bool = True
     roughness: float = 0.45
-    search_roughness: bool = True
+    fit_roughness: bool = True
     local_roughness: bool = True
     specular_prior: tuple[float, float] = (0.7, 0.25)
 

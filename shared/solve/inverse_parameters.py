@@ -40,7 +40,7 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         bounce=params.bounce,
         specular=params.specular,
         roughness=params.roughness,
-        search_roughness=params.search_roughness,
+        fit_roughness=params.fit_roughness,
         local_roughness=params.local_roughness,
         specular_prior=(params.specular_prior, SPECULAR_SPREAD),
     )

@@ -168,7 +168,7 @@ class _Climber:
         present, settings, forced = self.ladder.present, self.settings, self.forced
         appearance = present.model.applied(settings.appearance)
         local = appearance.local_roughness and "roughness" in forced
-        appearance = replace(appearance, local_roughness=local, search_roughness=False)  # the ladder found it
+        appearance = replace(appearance, local_roughness=local, fit_roughness=False)  # the ladder found it
         widths = settings.specular_widths if "specular" in forced else POOLING[self.gloss.specular]
         settings = replace(settings, appearance=appearance, shape=None, specular_widths=widths)
         found = self.gloss, self.shape_record, tuple(self.rungs)

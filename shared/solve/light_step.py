@@ -68,7 +68,7 @@ class LightStep:
         self.solver = solver
         self.model = solver.state.light_model
         self.light = solver.state.light
-        self.seeks_roughness = solver.trust_highlights and solver.settings.search_roughness
+        self.seeks_roughness = solver.trust_highlights and solver.settings.fit_roughness
         if self.seeks_roughness and solver.slopes is None:
             solver.bake_slopes()
         self.irradiance, self.reflection = solver.forward(self.light)
