@@ -55,12 +55,24 @@ def shape_sheet(start: Mesh, mesh: Mesh, face: np.ndarray | None, size: int = 40
     return sheet
 
 
+def shaded_picture(mesh: Mesh, yaw: float, centre: np.ndarray, extent: float, size: int) -> np.ndarray:
+    """uint8 [size, size, 3]: the mesh in grey under the pictures' lamp; camera as turned_camera has it."""
+    shape, (pose, lens) = _Shape.of(mesh), turned_camera(yaw, centre, extent, size)
+    return _drawn(shape, _shade(shape.normals @ pose[:3, :3].T @ WORLD_FROM_CAMERA), pose, lens, size)
+
+
+def turned_camera(yaw: float, centre: np.ndarray, extent: float, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """camera_from_head [4, 4] and intrinsics [3, 3] of a picture of size^2 pixels, extent mm wide at the centre [3],
+    from far away; yaw in radians, 0: from the front."""
+    turn = WORLD_FROM_CAMERA @ rotation_from_vector(np.array([0.0, yaw, 0.0]))
+    lens = np.array([[DISTANCE * size, 0.0, size / 2], [0.0, DISTANCE * size, size / 2], [0.0, 0.0, 1.0]])
+    return rigid(turn, -turn @ centre + [0.0, 0.0, DISTANCE * extent]), lens
+
+
 def _views(before: _Shape, after: _Shape, yaw, centre, extent, size) -> np.ndarray:
     """The four pictures of one direction, [4 size, size, 3]."""
-    turn = WORLD_FROM_CAMERA @ rotation_from_vector(np.array([0.0, yaw, 0.0]))
-    pose = rigid(turn, -turn @ centre + [0.0, 0.0, DISTANCE * extent])
-    lens = np.array([[DISTANCE * size, 0.0, size / 2], [0.0, DISTANCE * size, size / 2], [0.0, 0.0, 1.0]])
-    to_picture = turn.T @ WORLD_FROM_CAMERA
+    pose, lens = turned_camera(yaw, centre, extent, size)
+    to_picture = pose[:3, :3].T @ WORLD_FROM_CAMERA
     raised = ((after.mesh.vertices - before.mesh.vertices) * before.normals).sum(1)
     share = np.clip(raised / LARGEST_DIFFERENCE_MM, -1.0, 1.0)[:, None]
     difference = 1.0 - np.maximum(share, 0.0) * [0.0, 1.0, 1.0] + np.minimum(share, 0.0) * [1.0, 1.0, 0.0]

@@ -7,7 +7,7 @@ import numpy as np
 
 from shared.mesh import vertex_normals
 from tools.bench_appearance import open_clip
-from tools.bench_shape import COLUMNS, main, shape_errors
+from tools.bench_shape import COLUMNS, main, profile_picture, shape_errors
 
 TINY = Path(__file__).parent / "tiny"
 SMALL = "points=400 directions=128 bounce_nodes=100 light_resolution=4 shape_subdivisions=0".split()
@@ -33,3 +33,12 @@ def test_a_row_for_each_lambda_beside_the_tracked_mesh(tiny_run, tmp_path, capsy
     assert 0.0 < float(refined["distance_median_mm"]) != float(tracked["distance_median_mm"])
     assert float(refined["held_out_residual"]) > 0.0 and int(refined["stopped"]) >= 0
     assert capsys.readouterr().out.split()[: len(COLUMNS)] == list(COLUMNS)
+
+
+def test_profiles_of_one_mesh_coincide(tiny_run):
+    """The exported mesh's place taken by the truth: both pictures alike, and its red outline over the black one."""
+    clip, _ = open_clip(TINY, tiny_run, False)
+    truth, mesh, outlines, *_ = np.split(profile_picture(TINY, clip, clip.mesh, 160), 5, axis=1)
+    assert np.mean(np.abs(truth.astype(int) - mesh) > 8) < 0.02 and len(np.unique(truth)) > 50
+    red = (outlines == [255, 0, 0]).all(2)
+    assert 100 < red.sum() < 2000 and (outlines == 0).all(2).sum() < 0.1 * red.sum()

@@ -1,9 +1,12 @@
 """Measures the refined shape against a subject's truth, for several lambda of the large steps.
 
     python -m tools.bench_shape SUBJECT RUN [--smoothness 1 5 19 50 200] [--set key=value] [--out shape.csv]
+    python -m tools.bench_shape SUBJECT RUN --picture profile.png
+        the exported mesh beside the truth in profile and from three quarters, and the outlines: truth black, tracked
+        mesh blue, exported mesh red
 
-SUBJECT: a folder with gt/; RUN: a run's folder whose work/ holds sample_frames and track_landmarks. The first row is the
-tracked mesh, unrefined. distance: of the true face to the surface after a similarity. normals: where frames see the
+SUBJECT: a folder with gt/; RUN: a run's folder whose work/ holds sample_frames and track_landmarks. The first row is
+the tracked mesh, unrefined. distance: of the true face to the surface after a similarity. normals: where frames see the
 face, of the mesh alone, without its normal map. stopped: vertices that moved less than wanted, since the surface would
 have cut itself. cuts: edges that pass through a face.
 """
@@ -15,12 +18,18 @@ import csv
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from shared.geometry import Similarity
 from shared.intersections import crossing_edges
 from shared.io.arrays import load_arrays
 from shared.io.clip_inputs import ClipInputs
+from shared.io.images import write_png
+from shared.io.meshes import read_obj
 from shared.mesh import Mesh
+from shared.raycast import RayScene, camera_hits
+from shared.shape_pictures import shaded_picture, turned_camera
 from shared.solve.inverse import solve_clip
 from tools.bench_appearance import open_clip, settings_of, silent
 from tools.score import Result, camera_intrinsics, score_appearance, score_geometry
@@ -28,21 +37,19 @@ from tools.score import Result, camera_intrinsics, score_appearance, score_geome
 SMOOTHNESS = (1.0, 5.0, 19.0, 50.0, 200.0)
 COLUMNS = ("smoothness", "distance_median_mm", "distance_p95_mm", "normal_median_deg", "normal_p95_deg", "stopped",
            "cuts", "held_out_residual", "seconds")
-SCORED_FRAMES = 12
+SCORED_FRAMES, PROFILE_MM = 12, 140.0
 
 
 def shape_errors(subject: Path, clip: ClipInputs, mesh: Mesh) -> dict[str, float]:
     """Distances in mm and angles in degrees of a mesh in the clip's head space to the true face."""
-    truth, frames = load_arrays(subject / "gt" / "poses.npz"), clip.frame_index
-    rng = np.random.default_rng(0)
-    poses = clip.camera_from_head
-    alignment, scores = score_geometry(subject, mesh, truth["camera_from_head"][frames], poses, rng)
-    known = np.intersect1d(truth["gt_frames"], frames)
+    frames, known = clip.frame_index, load_arrays(subject / "gt" / "poses.npz")["gt_frames"]
+    alignment, distance = _aligned(subject, clip, mesh)
+    known = np.intersect1d(known, frames)
     chosen = known[np.unique(np.linspace(0, len(known) - 1, min(SCORED_FRAMES, len(known))).astype(int))]
-    placed = dict(zip(frames.tolist(), poses, strict=True))
+    placed = dict(zip(frames.tolist(), clip.camera_from_head, strict=True))
     result = Result(subject, mesh, {}, placed, camera_intrinsics(subject))
+    rng = np.random.default_rng(0)
     normals = score_appearance(subject, result, chosen.tolist(), alignment.rotation, rng)["normal_deg"]
-    distance = scores["geometry_mm"]
     return {
         "distance_median_mm": distance["median"],
         "distance_p95_mm": distance["p95"],
@@ -50,6 +57,30 @@ def shape_errors(subject: Path, clip: ClipInputs, mesh: Mesh) -> dict[str, float
         "normal_p95_deg": normals["p95"],
         "cuts": len(crossing_edges(mesh.vertices, mesh.faces)),
     }
+
+
+def _aligned(subject: Path, clip: ClipInputs, mesh: Mesh) -> tuple[Similarity, dict]:
+    """truth_from_head of the mesh, and a summary of its distances in mm."""
+    poses = load_arrays(subject / "gt" / "poses.npz")["camera_from_head"][clip.frame_index]
+    rng = np.random.default_rng(0)
+    alignment, scores = score_geometry(subject, mesh, poses, clip.camera_from_head, rng)
+    return alignment, scores["geometry_mm"]
+
+
+def profile_picture(subject: Path, clip: ClipInputs, mesh: Mesh, size: int = 480) -> np.ndarray:
+    """uint8 [size, 5 size, 3]: truth and mesh in profile, the outlines, truth and mesh from three quarters."""
+    truth = read_obj(subject / "gt" / "mesh.obj")
+    alignment, _ = _aligned(subject, clip, mesh)
+    tracked, placed = (own.replace(vertices=alignment.points(own.vertices)) for own in (clip.mesh, mesh))
+    tip = truth.vertices[np.argmax(truth.vertices[:, 2])]
+    view = tip - [0.0, 5.0, 25.0], PROFILE_MM, size
+    drawn = [shaded_picture(own, np.radians(yaw), *view) for yaw in (-90.0, -40.0) for own in (truth, placed)]
+    camera = turned_camera(np.radians(-90.0), *view)
+    outlines = np.full_like(drawn[0], 255)
+    for own, ink in ((tracked, (60, 140, 255)), (truth, (0, 0, 0)), (placed, (255, 0, 0))):
+        covered = camera_hits(RayScene(own.vertices, own.faces), *camera, size, size)[0] >= 0
+        outlines[cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0] = ink
+    return np.concatenate([*drawn[:2], outlines, *drawn[2:]], axis=1)
 
 
 def refined(subject: Path, clip: ClipInputs, smoothness: float, given: dict) -> dict:
@@ -71,7 +102,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--smoothness", nargs="*", type=float, default=SMOOTHNESS, metavar="LAMBDA")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="parameters for every row")
     parser.add_argument("--out", type=Path, help="the table as CSV")
+    parser.add_argument("--picture", type=Path, help="the run's export beside the truth, instead of the table")
     options = parser.parse_args(arguments)
+    if options.picture:
+        clip, mesh = open_clip(options.subject, options.run, True)[0], read_obj(options.run / "export" / "mesh.obj")
+        write_png(options.picture, profile_picture(options.subject, clip, mesh))
+        return 0
     clip, given = open_clip(options.subject, options.run, True)[0], dict(text.split("=", 1) for text in options.set)
     rows = [{"smoothness": "tracked", **shape_errors(options.subject, clip, clip.mesh)}]
     print(" ".join(f"{name:>19s}" for name in COLUMNS))
