@@ -134,6 +134,9 @@ def test_errors_of_highlights_count_by_their_share():
     assert np.allclose(variance[[0, 3]], 0.0), "no highlight, or no sample at all"
     assert np.allclose(variance[1], (0.1 * 0.5 * 0.1 / 0.2) ** 2, rtol=1e-4)
     assert (variance[2] > 1.0).all()
+    own = np.array([specular, 0.25, specular, specular])
+    by_texel = accumulated(e, s, i, np.ones((6, 4))).highlight_variance(own)
+    assert np.allclose(by_texel[[0, 2, 3]], variance[[0, 2, 3]]) and (by_texel[1] < 0.5 * variance[1]).all()
 
 
 def test_robust_weights():

@@ -183,3 +183,11 @@ def test_held_out_frames_choose_the_pooling():
     assert record["held_out"]["6 texels"] < record["held_out"]["one value"]
     seen = texel_uv(surface)[:, 0] < 0.7
     assert abs(np.median(material.specular[seen]) - SPECULAR) < abs(0.2 - SPECULAR)
+
+
+def test_an_intensity_for_each_texel_is_the_one_where_all_are_alike(plate):
+    surface, material, _, _ = plate
+    _, own, _, _ = run_pass(specular=np.full(len(surface), SPECULAR, np.float32))
+    assert np.allclose(own.albedo, material.albedo, atol=1e-5)
+    assert np.allclose(own.specular, material.specular)
+    assert np.allclose(own.information, material.information, rtol=1e-4)

@@ -143,11 +143,11 @@ class NormalEquations:
         them. typical_albedo [3]: what the samples' variance was reckoned with."""
         return self.shadow / np.maximum(self.ee * np.square(typical_albedo), 1e-9)
 
-    def highlight_variance(self, specular: float) -> np.ndarray:
-        """[T, 3] of the log albedo, since highlights of intensity `specular` are wrong by HIGHLIGHT_ERROR of
-        themselves: little where they are a small share of what a texel sends out, all of it in hair that the model
+    def highlight_variance(self, specular: float | np.ndarray) -> np.ndarray:
+        """[T, 3] of the log albedo, since highlights of intensity `specular`, one or [T], are wrong by HIGHLIGHT_ERROR
+        of themselves: little where they are a small share of what a texel sends out, all of it in hair that the model
         gives a skin's gloss."""
-        share = specular * self.es / np.maximum(self.ei, 1e-9)
+        share = np.reshape(specular, (-1, 1)) * self.es / np.maximum(self.ei, 1e-9)
         return np.square(HIGHLIGHT_ERROR * share / np.maximum(1.0 - share, LEAST_MATTE_SHARE))
 
     def _bounded_albedo(self, typical_albedo: np.ndarray) -> np.ndarray:

@@ -67,7 +67,8 @@ class LitSamples:
 class TexturePass:
     """Per-texel albedo and specular intensity under a fixed light, roughness and geometry.
 
-    specular: the clip's one intensity, the prior's mean; typical_albedo [3]; sigma: how far a texel may leave it;
+    specular: the clip's one intensity or each texel's [T], the prior's mean; typical_albedo [3]; sigma: how far a texel
+    may leave it;
     light_trust: how much samples of each light count, by how well the model follows it; empty: all alike;
     region [V]: parts of the head, skin and hair, of which one says nothing of the other.
     """
@@ -78,7 +79,7 @@ class TexturePass:
         viewer: SurfaceViewer,
         shading: VertexShading,
         clip: Clip,
-        specular: float,
+        specular: float | np.ndarray,
         typical_albedo: np.ndarray,
         sigma: float = 0.25,
         noise: Noise | None = None,
