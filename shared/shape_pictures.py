@@ -57,8 +57,7 @@ def shape_sheet(start: Mesh, mesh: Mesh, face: np.ndarray | None, size: int = 40
 
 def shaded_picture(mesh: Mesh, yaw: float, centre: np.ndarray, extent: float, size: int) -> np.ndarray:
     """uint8 [size, size, 3]: the mesh in grey under the pictures' lamp; camera as turned_camera has it."""
-    shape, (pose, lens) = _Shape.of(mesh), turned_camera(yaw, centre, extent, size)
-    return _drawn(shape, _shade(shape.normals @ pose[:3, :3].T @ WORLD_FROM_CAMERA), pose, lens, size)
+    return _shaded(_Shape.of(mesh), *turned_camera(yaw, centre, extent, size), size)
 
 
 def turned_camera(yaw: float, centre: np.ndarray, extent: float, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -79,8 +78,12 @@ def _views(before: _Shape, after: _Shape, yaw, centre, extent, size) -> np.ndarr
     normals = after.normals @ to_picture
     values = np.concatenate([_shade(normals), 0.5 * normals + 0.5, difference], axis=1)
     refined = np.split(_drawn(after, values, pose, lens, size), 3, axis=2)
-    first = refined[0] if after is before else _drawn(before, _shade(before.normals @ to_picture), pose, lens, size)
+    first = refined[0] if after is before else _shaded(before, pose, lens, size)
     return np.concatenate([first, *refined])
+
+
+def _shaded(shape: _Shape, pose: np.ndarray, lens: np.ndarray, size: int) -> np.ndarray:
+    return _drawn(shape, _shade(shape.normals @ pose[:3, :3].T @ WORLD_FROM_CAMERA), pose, lens, size)
 
 
 def _shade(normals: np.ndarray) -> np.ndarray:

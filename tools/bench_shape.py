@@ -32,24 +32,22 @@ from shared.raycast import RayScene, camera_hits
 from shared.shape_pictures import shaded_picture, turned_camera
 from shared.solve.inverse import solve_clip
 from tools.bench_appearance import open_clip, settings_of, silent
-from tools.score import Result, camera_intrinsics, score_appearance, score_geometry
+from tools.score import Result, camera_intrinsics, score_appearance, score_geometry, scored_frames
 
 SMOOTHNESS = (1.0, 5.0, 19.0, 50.0, 200.0)
 COLUMNS = ("smoothness", "distance_median_mm", "distance_p95_mm", "normal_median_deg", "normal_p95_deg", "stopped",
            "cuts", "held_out_residual", "seconds")
-SCORED_FRAMES, PROFILE_MM = 12, 140.0
+PROFILE_MM = 140.0
 
 
 def shape_errors(subject: Path, clip: ClipInputs, mesh: Mesh) -> dict[str, float]:
     """Distances in mm and angles in degrees of a mesh in the clip's head space to the true face."""
-    frames, known = clip.frame_index, load_arrays(subject / "gt" / "poses.npz")["gt_frames"]
+    gt_frames = load_arrays(subject / "gt" / "poses.npz")["gt_frames"]
     alignment, distance = _aligned(subject, clip, mesh)
-    known = np.intersect1d(known, frames)
-    chosen = known[np.unique(np.linspace(0, len(known) - 1, min(SCORED_FRAMES, len(known))).astype(int))]
-    placed = dict(zip(frames.tolist(), clip.camera_from_head, strict=True))
-    result = Result(subject, mesh, {}, placed, camera_intrinsics(subject))
+    poses = dict(zip(clip.frame_index.tolist(), clip.camera_from_head, strict=True))
+    result = Result(subject, mesh, {}, poses, camera_intrinsics(subject))
     rng = np.random.default_rng(0)
-    normals = score_appearance(subject, result, chosen.tolist(), alignment.rotation, rng)["normal_deg"]
+    normals = score_appearance(subject, result, scored_frames(gt_frames, result), alignment.rotation, rng)["normal_deg"]
     return {
         "distance_median_mm": distance["median"],
         "distance_p95_mm": distance["p95"],

@@ -36,6 +36,7 @@ from tools import score_align, score_measures
 from tools.score_buffers import SurfaceViewer
 from tools.score_table import table
 
+SCORED_FRAMES = 12
 MAPS = {"albedo": "diffuse_albedo", "specular": "specular_intensity", "roughness": "roughness"}
 
 
@@ -65,7 +66,7 @@ def load_result(folder: Path, intrinsics: np.ndarray) -> Result:
 def score(
     subject: Path,
     export: Path,
-    frame_count: int = 12,
+    frame_count: int = SCORED_FRAMES,
     seed: int = 0,
     prepare: Callable[[score_align.Similarity], None] = lambda truth_from_result: None,
 ) -> dict:
@@ -89,11 +90,17 @@ def score(
     aligned = np.stack([alignment.pose(pose) for pose in found_poses])
     scores["pose"] = score_measures.pose_errors(true_poses, aligned)
     scores["pose_own_alignment"] = score_measures.pose_errors_own_alignment(true_poses, found_poses)
-    known = [int(i) for i in truth["gt_frames"] if int(i) in result.poses]
-    chosen = np.unique(np.linspace(0, len(known) - 1, min(frame_count, len(known))).astype(int))
-    scores |= score_appearance(subject, result, [known[k] for k in chosen], alignment.rotation, rng)
+    chosen = scored_frames(truth["gt_frames"], result, frame_count)
+    scores |= score_appearance(subject, result, chosen, alignment.rotation, rng)
     scores |= score_light(subject, export)
     return {"subject": subject.resolve().name, "result": str(export), **scores}
+
+
+def scored_frames(gt_frames: np.ndarray, result: Result, count: int = SCORED_FRAMES) -> list[int]:
+    """At most count of the frames whose truth is known and that have a pose in the result, spread evenly."""
+    known = [int(i) for i in gt_frames if int(i) in result.poses]
+    chosen = np.unique(np.linspace(0, len(known) - 1, min(count, len(known))).astype(int))
+    return [known[k] for k in chosen]
 
 
 def camera_intrinsics(subject: Path) -> np.ndarray:
