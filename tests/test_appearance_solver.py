@@ -246,3 +246,17 @@ def test_nodes_take_the_albedo_of_points_beside_them(truth):
     capture, _, _ = truth
     solver = AppearanceSolver(capture, MATTE)
     assert np.array_equal(solver.node_to_point, nearest_points(capture.nodes.points, capture.points))
+
+
+def test_points_of_few_samples_follow_the_scale(matte):
+    """The pull on them is towards skin of the scale that was found, not of the one before."""
+    capture, _, _ = matte
+    faint = replace(capture, samples=replace(capture.samples, weight=1e-3 * capture.samples.weight))
+    solver = AppearanceSolver(faint, replace(MATTE, bounce=False))
+    solver.bake()
+    solver.state.params += np.log(4.0)
+    solver.state.albedo /= 4.0
+    step = LightStep(solver)
+    assert step.settle() > 1.0
+    again = solver.eliminate(step.irradiance, torch.zeros_like(step.irradiance), step.weight)
+    assert float((step.albedo / again - 1.0).abs().max()) < 0.1

@@ -54,6 +54,12 @@ def hard_light(directions):
     return 0.15 + 40.0 * lamp[:, None] * np.array([1.0, 0.95, 0.9])
 
 
+def small_lamp(directions):
+    """One some eight degrees wide, there, and nearly nothing else."""
+    lamp = np.exp(200.0 * (directions @ normalised(np.array([-0.6, 0.5, 0.7])) - 1.0))
+    return 0.03 + 133.0 * lamp[:, None] * np.array([1.0, 0.95, 0.9])
+
+
 def coloured_light(directions):
     """A room whose left is red and whose right is green, grey in between."""
     side = directions[:, :1]

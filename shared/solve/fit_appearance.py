@@ -14,7 +14,11 @@ from shared.solve.light_step import LightStep
 from shared.solve.light_trust import weigh_samples
 from shared.solve.local_roughness import GlossEquations, local_roughness
 
-SHAPING_STEPS = 3
+SHAPING_STEPS, _SHAPED = 3, 0.1
+"""Without highlights at least as many steps, until one lowers the fitted residual by less than this fraction: in a
+light that has not found its lamps yet, highlights would be spread as wide as they can be, and lamps then never found.
+"""
+
 _WORTHWHILE, _WORTHWHILE_COARSE = 0.003, 0.03
 """A step that lowers the held-out residual by less than this fraction is the last of its resolution; the first of
 several resolutions is left earlier, since what it cannot resolve keeps its residual high."""
@@ -64,10 +68,10 @@ def fit_appearance(
     a capture much like this one, from which only the last resolution is gone through again; keep_start: its light as it
     is may win, too; least: steps from it before one that serves little may be the last.
 
-    The first steps only give the light its shape; highlights, which then begin to say something about the scale,
-    take part from the fourth, but not again after a step that had to be undone. Only states after the first steps, of
-    the light model asked for, can win, or the one that a step was undone to; of those that do about as well the last,
-    whose scale has come to rest.
+    The first steps only give the light its shape ("shaping" in their records); highlights, which then begin to say
+    something about the scale, take part after those, but not again after a step that had to be undone. Only states
+    after the first steps, of the light model asked for, can win, or the one that a step was undone to; of those that do
+    about as well the last, whose scale has come to rest.
     """
     solver = AppearanceSolver(capture, settings)
     # A clip too short to hold frames out is judged by the fitted ones.
@@ -80,16 +84,15 @@ def fit_appearance(
         trusts, first = trusts and start.trusted, len(schedule) - 1
     for stage, (model, resolution) in list(enumerate(schedule))[first:]:
         solver.set_light((model, resolution))
-        last = np.inf
+        last, last_fitted = np.inf, np.inf
         worthwhile = _WORTHWHILE if stage == len(schedule) - 1 else _WORTHWHILE_COARSE
-        shaping_steps = min(SHAPING_STEPS, settings.steps - 1) if stage == 0 and start is None else 0
-        enough = shaping_steps + 2 if stage == 0 and start is None else least
+        shaping = stage == 0 and start is None and settings.steps > 1
+        enough = 2 if shaping else least
         kept = None
         for number in range(settings.steps):
-            shaping = number < shaping_steps
             moves = number > 0 or not keep_start
             record, rise, by_frame = _step(solver, settings, trusts and not shaping, moves)
-            record |= {"light": model, "resolution": resolution, "step": number}
+            record |= {"light": model, "resolution": resolution, "step": number, "shaping": shaping}
             if kept is not None and rise > _LARGEST_RISE:
                 solver.state, solver.lobes, trusts = kept[1], None, False
                 records.append(record | {"undone": True})
@@ -105,10 +108,14 @@ def fit_appearance(
                 lowest = judged if best is None else min(judged, best[0])
                 if best is None or judged <= lowest * (1.0 + _WORTHWHILE):
                     best = (lowest, record, _copy(solver.state), by_frame)
-            if not shaping and number >= enough and judged > last * (1.0 - worthwhile):
+            if shaping:
+                shaped = number + 1 >= SHAPING_STEPS and record["fitted"] > last_fitted * (1.0 - _SHAPED)
+                if shaped or number + 2 >= settings.steps:
+                    shaping, enough = False, number + 1 + enough
+            elif number >= enough and judged > last * (1.0 - worthwhile):
                 if not trusts or record["rescaled"] < _SETTLED_SCALE:
                     break
-            last = judged
+            last, last_fitted = judged, record["fitted"]
     _, record, state, by_frame = best
     errors = record["fitted"], record["held_out"]
     light_trust = tuple(record.get("light_trust", ()))

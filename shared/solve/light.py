@@ -78,7 +78,8 @@ class LogPrior:
         return cost, self._differences.T @ (weight * step) + white * chroma, product
 
 
-def resample_light(log_light: np.ndarray, resolution: int) -> np.ndarray:
-    """The log light [6 n^2, C] on a cubemap of another resolution, interpolated bilinearly."""
-    source = round((len(log_light) / 6) ** 0.5)
-    return cube_lookup(cube_directions(resolution), source) @ log_light
+def resample_light(light: np.ndarray, resolution: int) -> np.ndarray:
+    """The light [6 n^2, C] on a cubemap of another resolution, interpolated bilinearly as FrameLight does, so that
+    surfaces receive the same: between logarithms a lamp of one texel would lose most of its light."""
+    source = round((len(light) / 6) ** 0.5)
+    return cube_lookup(cube_directions(resolution), source) @ light

@@ -88,7 +88,7 @@ class LogLight:
 
     def fit(self, radiance: np.ndarray) -> np.ndarray:
         """Parameters whose light comes closest to a cubemap of any resolution, in the logarithm -> [M, 3]."""
-        log_light = resample_light(np.log(radiance), self.resolution)
+        log_light = np.log(resample_light(radiance, self.resolution))
         if self.basis is None:
             return log_light
         root = np.sqrt(cube_solid_angles(self.resolution))[:, None]
@@ -164,7 +164,7 @@ class LampLight:
 
     def fit(self, radiance: np.ndarray) -> np.ndarray:
         """The lamp takes what exceeds the median of a cubemap around its brightest direction, the sky the rest."""
-        fine = np.exp(resample_light(np.log(radiance), self.resolution))
+        fine = resample_light(radiance, self.resolution)
         solid = cube_solid_angles(self.resolution)[:, None]
         median = np.median(fine, axis=0)
         excess = np.maximum(fine - median, 0.0) * solid

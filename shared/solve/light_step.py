@@ -138,6 +138,7 @@ class LightStep:
         solver.state.params = self.model.scaled(solver.state.params, log_factor)
         solver.state.specular = specular if settings.specular else 0.0
         self.irradiance, self.reflection = self.irradiance * factor, self.reflection * factor
+        solver.state.albedo = solver.state.albedo * np.exp(-log_factor)  # what points of few samples are pulled to
         self._fit_points(solver.state.specular * self.reflection)
         return float(np.abs(log_factor).max())
 
