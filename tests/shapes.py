@@ -1,10 +1,16 @@
-"""Simple surfaces that several tests use."""
+"""Simple surfaces that several tests use, and a camera before them."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from shared.geometry import rigid, rotation_from_vector
 from shared.mesh import Mesh, midpoint_subdivision, normalised
+
+LENS = np.array([[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]])
+"""Intrinsics of a camera of 160 x 120 pixels."""
+FACING = np.diag([1.0, -1.0, -1.0])
+"""Rotation of a head that looks into the camera."""
 
 
 def sphere(radius: float = 1.0, levels: int = 4) -> Mesh:
@@ -28,3 +34,9 @@ def grid_plane(count: int = 9, extent: float = 1.0) -> Mesh:
     upper = np.stack([corner, corner + count + 1, corner + count], axis=1)
     faces = np.concatenate([lower, upper]).astype(np.int32)
     return Mesh(vertices, faces, uvs, faces)
+
+
+def nods(degrees, axis=(0.0, 1.0, 0.0), distance=900.0):
+    """Poses before the camera, turned by these angles about an axis of the head."""
+    rotation = FACING @ rotation_from_vector(np.radians(degrees)[:, None] * np.array(axis))
+    return rigid(rotation, np.tile([0.0, 0, distance], (len(degrees), 1)))

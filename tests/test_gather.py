@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from shapes import grid_plane, sphere
-from test_shading import FACING, LENS, nods
+from shapes import FACING, LENS, grid_plane, nods, sphere
 
 from shared.gather import (
     BALL_MM,

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from quadrature import hemisphere_quadrature
-from shapes import sphere
+from shapes import FACING, nods, sphere
 
 from shared.brdf import directional_albedo, specular_cosine
 from shared.envmap import cube_directions, cube_solid_angles
-from shared.geometry import fibonacci_sphere, rigid, rotation_from_vector
+from shared.geometry import fibonacci_sphere
 from shared.lobe_tables import specular_tables
 from shared.lobes import LobeTable, specular_reflection
 from shared.mesh import normalised
@@ -19,8 +19,6 @@ from shared.transfer import bounce_nodes, mesh_points, trace_transfer
 
 DIRECTIONS = fibonacci_sphere(768)
 COSINES = np.array([0.25, 0.5, 0.8, 1.0])
-LENS = np.array([[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]])
-FACING = np.diag([1.0, -1.0, -1.0])
 
 
 def towards_at(cosines):
@@ -91,12 +89,6 @@ def test_a_part_of_the_table_is_those_points():
 
 
 # ---------------------------------------------------------------------- shading of a mesh
-
-
-def nods(degrees, axis=(0.0, 1.0, 0.0), distance=900.0):
-    """Poses before the camera, turned by these angles about an axis of the head."""
-    rotation = FACING @ rotation_from_vector(np.radians(degrees)[:, None] * np.array(axis))
-    return rigid(rotation, np.tile([0.0, 0, distance], (len(degrees), 1)))
 
 
 def shade(mesh, light, poses, moves="head", albedo=0.5, **options):
