@@ -149,7 +149,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--cases", choices=SETS, default="quick")
     found.add_argument("--base", help="the preset that ablations change (quick: draft, all: standard)")
     found.add_argument("--only", nargs="*", metavar="WORD", help="cases of these names, or whose name holds a word")
-    found.add_argument("--repeats", type=int, default=2)
+    found.add_argument("--repeats", type=int, default=1, help="of all cases (1)")
     found.add_argument("--minutes", type=float, help="no case begins later")
     found.add_argument("--work", type=Path, default=REPOSITORY / "build" / "chart_work", help="for unfinished runs")
     found.add_argument("--out", type=Path, default=REPOSITORY / "build" / "chart", help="for the table and the chart")
