@@ -1,7 +1,7 @@
 # make demo    set-up, then the embedded subject from clip to scores
 # make test    set-up, then all tests
 # make setup   the set-up alone
-# make chart   set-up, then speed against accuracy on the embedded subject (an hour); CASES=all SUBJECT=DIR: more
+# make chart   set-up, then speed against accuracy on the embedded subject (15 minutes); CASES=all SUBJECT=DIR: more
 # make stress  set-up, then where Limn fails and whether it says so (an hour on one core; goes on where it was stopped)
 # make audit   licences, changed files, bill of materials; ADVISORIES=all.zip: known vulnerabilities, too
 PYTHON ?= python3

@@ -319,6 +319,6 @@ def test_no_case_begins_when_the_minutes_are_over(command):
 def test_it_lists_what_is_there_and_wants_a_truth(command, tmp_path, capsys):
     run, calls, _ = command
     assert run("--list") == 0 and calls == []
-    assert "draft, matte: 0 of 2; draft inverse_render.specular=false" in capsys.readouterr().out
+    assert "draft, matte: 0 of 1; draft inverse_render.specular=false" in capsys.readouterr().out
     assert chart.main([str(make_subject(tmp_path / "poem"))]) == 2
     assert "no ground truth" in capsys.readouterr().err

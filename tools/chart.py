@@ -11,8 +11,8 @@ Writes   OUT/chart.json and chart.csv, a row per case and repeat: seconds and pr
          memory, all scores of tools.score; OUT/chart.svg and chart.html: accuracy over seconds with the Pareto front.
 Resumes  rows of the same code, subject, parameters and threads are kept, and finished stages in WORK, too. Cut it off
          at any time, or let it end by itself with --minutes (no case begins later).
-Cases    quick: draft and standard, ablations of draft, the published solver cut short, Mitsuba for two minutes: an
-         hour for the demo subject on two cores. all: fine as well, ablations of standard, longer runs of the others.
+Cases    quick: draft and standard, ablations of draft, the published solver cut short, Mitsuba for two minutes: 15
+         minutes for the demo subject on two cores. all: fine as well, ablations of standard, longer runs of the others.
          Mitsuba 3 is optional (pip install mitsuba; it also needs LLVM, see docs/chart.md).
 """
 
