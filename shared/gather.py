@@ -77,6 +77,7 @@ class SurfaceViewer:
         self.mesh, self.scene, self.offset = mesh, scene, offset
         self.error_mm, self.least_cosine = 0.0, MINIMUM_VIEW_COSINE
         self.normals = vertex_normals(mesh.vertices, mesh.faces)
+        self._vertices, self._normals = mesh.vertices, self.normals
         faces = mesh.faces
         edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
         length = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
@@ -99,18 +100,29 @@ class SurfaceViewer:
         viewer.least_cosine = float(np.clip(rim, MINIMUM_VIEW_COSINE, MAXIMUM_LEAST_COSINE))
         return viewer
 
+    def limited_to(self, index: np.ndarray) -> tuple[SurfaceViewer, np.ndarray]:
+        """The same, whose views only have the vertices index [P] and those within the margin of them, and which rows of
+        a view the vertices index are."""
+        wanted = np.zeros(len(self._vertices), bool)
+        wanted[index] = True
+        chosen = np.nonzero(self.grown(wanted))[0]
+        viewer = copy(self)
+        viewer._vertices, viewer._normals = self._vertices[chosen], self._normals[chosen]
+        viewer._adjacency = self._adjacency[chosen][:, chosen]
+        return viewer, np.searchsorted(chosen, index)
+
     def view(self, camera_from_head: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]) -> View:
         """All vertices in one camera. size: (width, height) of the picture in pixels."""
-        vertices = self.mesh.vertices
+        vertices, normals = self._vertices, self._normals
         pixels, depth = project(vertices, camera_from_head, intrinsics)
         centre = -camera_from_head[:3, 3] @ camera_from_head[:3, :3]
         towards = centre - vertices
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        cosine = (towards * self.normals).sum(1)
+        cosine = (towards * normals).sum(1)
         within = ((pixels > 1.0) & (pixels < np.array(size) - 1.0)).all(1) & (depth > 0)
         seen = within & (cosine > self.least_cosine)
         index = np.nonzero(seen)[0]
-        origins = vertices[index] + self.offset * self.normals[index]
+        origins = vertices[index] + self.offset * normals[index]
         hidden = index[self.scene.occluded(origins, towards[index])]
         weight = np.where(seen, cosine**2, 0.0)
         covered = np.zeros(len(vertices), bool)
@@ -204,6 +216,7 @@ def gather_samples(
     intrinsics = np.broadcast_to(intrinsics, (len(camera_from_head), 3, 3))
     colours, limits = np.zeros(shape + (3,), np.float32), np.zeros(shape + (3,), np.int8)
     weight, towards = np.zeros(shape, np.float32), np.zeros(shape + (3,), np.float32)
+    viewer, index = viewer.limited_to(index)
     for f, picture in enumerate(pictures):
         view = viewer.view(camera_from_head[f], intrinsics[f], picture.inside.shape[::-1])
         towards[:, f] = view.towards_camera[index]

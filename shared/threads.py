@@ -12,6 +12,25 @@ Result = TypeVar("Result")
 
 
 def share_out(count: int, work: Callable[[int], Result]) -> list[Result]:
-    """Does work(0) to work(count - 1), on as many threads as torch may use -> what they return, in order."""
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        return list(pool.map(work, range(count)))
+    """Does work(0) to work(count - 1), on as many threads as torch may use -> what they return, in order.
+
+    Each thread takes the next number when it is done with its last. The caller is one of them: with a single thread
+    nothing is handed over, which for small pieces of work can cost as much as they do.
+    """
+    results: list = [None] * count
+    numbers = iter(range(count))  # threads that share it never get the same one
+
+    def toil() -> None:
+        for number in numbers:
+            results[number] = work(number)
+
+    others = min(torch.get_num_threads(), count) - 1
+    if others < 1:
+        toil()
+        return results
+    with ThreadPoolExecutor(others) as pool:
+        helping = [pool.submit(toil) for _ in range(others)]
+        toil()
+    for helper in helping:
+        helper.result()
+    return results

@@ -128,6 +128,22 @@ def test_what_lies_behind_an_edge_is_left_out_with_a_margin():
     assert (view.weight[len(wall.vertices) :] > 0.9).all()
 
 
+def test_a_view_of_some_vertices_is_the_whole_view_there():
+    """Also next to what hides them: the margin is that of the whole mesh."""
+    wall, plate = grid_plane(41, 80.0), grid_plane(9, 30.0)
+    vertices = np.concatenate([wall.vertices, plate.vertices + [0, 0, 50.0]])
+    mesh = wall.replace(vertices=vertices, faces=np.concatenate([wall.faces, plate.faces + len(wall.vertices)]))
+    viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces), margin_mm=4.0)
+    index = np.arange(0, len(wall.vertices), 7)[::-1]
+    limited, rows = viewer.limited_to(index)
+    camera = rigid(FACING, np.array([0, 0, 450.0])), LENS, (160, 120)
+    whole, part = viewer.view(*camera), limited.view(*camera)
+    assert len(part.weight) < len(whole.weight)
+    assert 0.1 < (whole.weight[index] == 0).mean() < 0.9
+    for name, values in vars(whole).items():
+        assert np.array_equal(getattr(part, name)[rows], values[index]), name
+
+
 def test_samples_are_the_colours_behind_the_vertices():
     """The picture shows each pixel's own coordinates, so samples must equal the projections."""
     ball = sphere(40.0, 3)

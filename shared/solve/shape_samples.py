@@ -64,6 +64,7 @@ def look_at_surface(
     width of the blur on the surface.
     """
     views, intrinsics = [], np.broadcast_to(intrinsics, (len(camera_from_head), 3, 3))
+    viewer, index = viewer.limited_to(index)
     for pose, lens, picture in zip(camera_from_head, intrinsics, pictures, strict=True):
         view = viewer.view(pose, lens, picture.inside.shape[::-1])
         weight = view.weight[index]
