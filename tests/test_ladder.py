@@ -149,6 +149,28 @@ def test_where_shadows_do_not_serve_all_parts_are_tried_at_once(monkeypatch, alo
         assert records[-1]["rung"] == "cubemap_16"  # and the climb goes on from there
 
 
+def tried_rungs(monkeypatch, error_of):
+    """What is tried, in order, where a model's error is as given for all frames."""
+    records, frames = [], np.linspace(0.99, 1.01, 9)
+    monkeypatch.setattr(Ladder, "_try", lambda self, model, start: Trial(model, None, error_of(model) * frames, 0.1))
+    monkeypatch.setattr(Ladder, "_at_bottom", lambda self: False)
+    Ladder({}, CAREFUL, allowed_rungs(CAREFUL), records.append).climb()
+    return [(record["rung"], record["climbed"]) for record in records if record["part"] in ("light", "specular")]
+
+
+def test_harmonics_are_passed_over_once_a_sun_serves(monkeypatch):
+    error = {"harmonics_2": 1.0, "sun_sky": 0.8, "harmonics_4": 0.1, "cubemap_8": 0.9, "cubemap_16": 0.9}
+    found = tried_rungs(monkeypatch, lambda model: error[model.light])
+    assert ("sun_sky", True) in found and "harmonics_4" not in dict(found)
+    assert found[1:3] == [("cubemap_8", False), ("cubemap_16", False)]
+
+
+@pytest.mark.parametrize(("saved", "worth"), [(0.01, False), (0.03, True)])
+def test_highlights_must_save_more_than_other_rungs(monkeypatch, saved, worth):
+    found = tried_rungs(monkeypatch, lambda model: 1.0 - saved * (model.specular == "one_value"))
+    assert ("one_value", worth) in found
+
+
 def test_the_fall_is_paired_by_frame():
     """Frames differ by far more than the models do: only the differences count."""
     rng = np.random.default_rng(0)

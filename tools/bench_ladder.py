@@ -34,7 +34,7 @@ from tools.bench_appearance import settings_of, silent
 
 LEAST = {"visibility": False, "specular": False, "light_model": "harmonics_2"}
 RUNGS: dict[str, dict] = {
-    "auto": {"model": "auto"},
+    "auto": {"model": "auto", "light_resolution": 32},
     "least": LEAST,
     "harmonics_2": {"light_model": "harmonics_2"},
     "harmonics_2_matte": {"light_model": "harmonics_2", "specular": False},

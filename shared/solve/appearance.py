@@ -46,7 +46,8 @@ ALBEDO_PULL = 25.0
 class Settings:
     """light_model: see light_models; resolutions: cubemap edge per stage of the solve; independent: how many of the
     samples count as independent evidence against the priors; noise: absolute and relative standard deviation of a
-    sample; visibility: whether parts of the head cover each other."""
+    sample; visibility: whether parts of the head cover each other; precision: most products of a step of the light, and
+    by how much its residual must fall."""
 
     light_model: str = "cubemap"
     resolutions: tuple[int, ...] = (8, 16)
@@ -63,6 +64,7 @@ class Settings:
     fit_roughness: bool = True
     local_roughness: bool = True
     specular_prior: tuple[float, float] = (0.7, 0.25)
+    precision: tuple[int, float] = (20, 0.01)
 
     def light_moves(self, moves: str) -> str:
         """What moves against the light: a lamp at the camera goes with it, so that the head moves in any capture."""

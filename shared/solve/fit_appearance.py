@@ -14,9 +14,10 @@ from shared.solve.light_step import LightStep
 from shared.solve.light_trust import weigh_samples
 from shared.solve.local_roughness import GlossEquations, local_roughness
 
-SHAPING_STEPS, _SHAPED = 3, 0.1
-"""Without highlights at least as many steps, until one lowers the fitted residual by less than this fraction: in a
-light that has not found its lamps yet, highlights would be spread as wide as they can be, and lamps then never found.
+_SHAPING_STEPS, _SHAPED = 3, 0.1
+"""Without highlights at least as many steps from a uniform light, until one changes the fitted residual by less than
+this fraction: in a light that has not found its lamps yet, highlights would be spread as wide as they can be, and lamps
+then never found. Likewise in a light that was just made to fit another model, which may have lost them.
 """
 
 _WORTHWHILE, _WORTHWHILE_COARSE = 0.003, 0.03
@@ -63,30 +64,34 @@ def fit_appearance(
     start: Solution | None = None,
     keep_start: bool = False,
     least: int = 1,
+    shapes: bool = False,
 ) -> Solution:
     """Fits light, albedo, specular intensity and roughness; report receives each step's record. start: the solution of
     a capture much like this one, from which only the last resolution is gone through again; keep_start: its light as it
-    is may win, too; least: steps from it before one that serves little may be the last.
+    is may win, too; least: steps from it before one that serves little may be the last; shapes: the start's light is
+    not one to judge highlights by, being of another model, or found without any.
 
-    The first steps only give the light its shape ("shaping" in their records); highlights, which then begin to say
-    something about the scale, take part after those, but not again after a step that had to be undone. Only states
-    after the first steps, of the light model asked for, can win, or the one that a step was undone to; of those that do
-    about as well the last, whose scale has come to rest.
+    The first steps, and those after a change of the light's model, only give the light its shape ("shaping" in their
+    records); highlights, which then begin to say something about the scale, take part after those, but not again after
+    a step that had to be undone. Only states after the first steps, of the light model asked for, can win, or the one
+    that a step was undone to; of those that do about as well the last, whose scale has come to rest.
     """
     solver = AppearanceSolver(capture, settings)
     # A clip too short to hold frames out is judged by the fitted ones.
     name, share = ("fitted", 1.0) if capture.fitted.all() else ("held_out", 1.0 - capture.fitted.mean())
     judge = partial(_judged, name=name, count=share * settings.independent)
     records, best, schedule = [], None, settings.light_schedule
-    trusts, first = settings.specular, 0
+    trusts, first, last_fitted = settings.specular, 0, np.inf
     if start is not None:
         solver.start_from(start.state)
         trusts, first = trusts and start.trusted, len(schedule) - 1
+        last_fitted = start.fitted if keep_start else np.inf
     for stage, (model, resolution) in list(enumerate(schedule))[first:]:
         solver.set_light((model, resolution))
-        last, last_fitted = np.inf, np.inf
+        last, shaping_steps = np.inf, _SHAPING_STEPS if start is None and stage == 0 else 1
         worthwhile = _WORTHWHILE if stage == len(schedule) - 1 else _WORTHWHILE_COARSE
-        shaping = stage == 0 and start is None and settings.steps > 1
+        anew = shapes or start is None if stage == first else trusts and model != schedule[stage - 1][0]
+        shaping = anew and settings.steps > 1
         enough = 2 if shaping else least
         kept = None
         for number in range(settings.steps):
@@ -109,8 +114,8 @@ def fit_appearance(
                 if best is None or judged <= lowest * (1.0 + _WORTHWHILE):
                     best = (lowest, record, _copy(solver.state), by_frame)
             if shaping:
-                shaped = number + 1 >= SHAPING_STEPS and record["fitted"] > last_fitted * (1.0 - _SHAPED)
-                if shaped or number + 2 >= settings.steps:
+                change = abs(record["fitted"] / last_fitted - 1.0)
+                if number + 1 >= shaping_steps and change < _SHAPED or number + 2 >= settings.steps:
                     shaping, enough = False, number + 1 + enough
             elif number >= enough and judged > last * (1.0 - worthwhile):
                 if not trusts or record["rescaled"] < _SETTLED_SCALE:

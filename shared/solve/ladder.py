@@ -3,8 +3,8 @@
 Each part of the model has rungs of its own, from the least to the most:
 
     visibility  off, on, bounces
-    specular    none, one_value; by_segment, local (ladder_gloss)
     light       harmonics_2, sun_sky, harmonics_4, cubemap_8, cubemap_16, cubemap_32
+    specular    none, one_value; by_segment, local (ladder_gloss)
     geometry    tracked, refined, subdivided (ladder_clip)
     roughness   one_value; by_segment, local (ladder_gloss)
 
@@ -43,12 +43,18 @@ VISIBILITIES = ("off", "on", "bounces")
 SPECULARS = ("none", "one_value")
 WORTHWHILE = 0.005
 """Share of the error that a rung with more unknowns must save besides: as much as the solver leaves when it stops."""
+WORTHWHILE_GLOSS = 0.02
+"""Likewise of the first highlights, the dearest of all rungs: three quarters of a fit's time."""
 PARTS = ("visibility", "specular", "light", "geometry", "roughness")
 """What can be forced."""
 FEWEST_HELD_OUT = 3
 """Frames, below which differences between them have no standard error."""
 CLIMB_STEPS, MOVES = 8, 2
-"""Most steps on a rung, and so many at least: the first from a light of another model can lead uphill."""
+"""Most steps from a rung to the next, and so many at least: the first from a light of another model can lead uphill."""
+CLIMB_PRECISION = (10, 0.03)
+"""Of a step of the light while climbing: what is chosen is solved again, with Settings.precision."""
+FINE_LIGHTS, FINE_MOVES = ("cubemap_16", "cubemap_32"), 4
+"""What these add, the shape of a lamp, only comes out in several steps of the whole solve's precision."""
 LOOK_AHEAD = 2
 
 
@@ -81,8 +87,8 @@ def allowed_rungs(settings: Settings, forced: frozenset[str] = frozenset()) -> d
     visibility = 1 + settings.visibility + (settings.visibility and settings.bounce)
     rungs = {
         "visibility": VISIBILITIES[:visibility],
-        "specular": SPECULARS[: 1 + settings.specular],
         "light": lights if settings.light_model == "cubemap" else (settings.light_model,),
+        "specular": SPECULARS[: 1 + settings.specular],  # last: with highlights a rung costs ten times as much
     }
     return {part: names[-1:] if part in forced else names for part, names in rungs.items()}
 
@@ -123,7 +129,7 @@ class Ladder:
         report: Callable[[dict], None] = lambda record: None,
     ):
         self.captures, self.rungs, self.report = captures, rungs, report
-        self.settings = replace(settings, steps=min(settings.steps, CLIMB_STEPS))
+        self.settings = settings
         self.tried: set[Model] = set()
         self.present: Trial | None = None
 
@@ -133,7 +139,7 @@ class Ladder:
             self.begin(Model(**{part: names[0] for part, names in self.rungs.items()}))
             self.report(describe("start", ", ".join(self.present.model), self.present))
         self._climb_parts()
-        if self.present.model.visibility != self.rungs["visibility"][-1] and self._leap():
+        if self.present.model.visibility == "off" != self.rungs["visibility"][-1] and self._leap():
             self._climb_parts()
         return self.present
 
@@ -151,7 +157,8 @@ class Ladder:
             return False
         self.tried.add(model)
         trial = self._try(model, None)
-        better = serves(self.present.errors, trial.errors)
+        glossier = model.specular != self.present.model.specular
+        better = serves(self.present.errors, trial.errors, WORTHWHILE_GLOSS if glossier else WORTHWHILE)
         self.report(describe("leap", ", ".join(model), trial, self.present, better))
         if better:
             self.present = trial
@@ -171,8 +178,12 @@ class Ladder:
         place = names.index(getattr(self.present.model, part))
         while missed < self._patience(part) and place + 1 < len(names):
             place += 1
+            if (self.present.model.light, names[place]) == ("sun_sky", "harmonics_4"):
+                continue  # which cannot show the sun
             model = self.present.model._replace(**{part: names[place]})
-            if model in self.tried:
+            # What a finer cubemap did not show of matt skin it does not show of glossy skin either, on the same mesh.
+            finer = part == "light" and self.present.model.light.startswith("cubemap")
+            if model in self.tried or finer and model._replace(specular="none") in self.tried:
                 missed += 1
                 continue
             self.tried.add(model)
@@ -181,7 +192,7 @@ class Ladder:
                 # What fits without shadows can be a long way from what fits with them.
                 trial = min(trial, self._try(model, None), key=lambda trial: trial.errors.mean())
             # Shadows and bounces bring no unknowns that could follow the noise, and cost next to nothing.
-            worthwhile = 0.0 if part == "visibility" else WORTHWHILE
+            worthwhile = {"visibility": 0.0, "specular": WORTHWHILE_GLOSS}.get(part, WORTHWHILE)
             better = serves(self.present.errors, trial.errors, worthwhile)
             self.report(describe(part, names[place], trial, self.present, better))
             if better:
@@ -200,13 +211,24 @@ class Ladder:
 
     def _try(self, model: Model, start: Solution | None) -> Trial:
         begun = time.perf_counter()
-        settings, capture, keep_start = model.applied(self.settings), self._capture(model), start is not None
+        settings, capture, keeps_start = model.applied(self.settings), self._capture(model), start is not None
+        fine = model.light in FINE_LIGHTS
+        if not fine:
+            settings = replace(settings, precision=CLIMB_PRECISION)
+        # A cubemap can show what any light before it is; the others can lose the lamp that highlights were found in.
+        changed = self.present is not None and model.light != self.present.model.light
+        shapes = not keeps_start or changed and not model.light.startswith("cubemap")
         if start is None:
             start = Solution(AppearanceSolver(capture, settings).state, (), np.inf, np.inf)
+        else:
+            settings = replace(settings, steps=min(settings.steps, CLIMB_STEPS))
+        if changed:  # another light, another chance for highlights
+            start = replace(start, trusted=True)
         if settings.specular and start.state.specular == 0.0:
             fresh = replace(start.state, specular=settings.specular_prior[0], roughness=settings.roughness)
-            start = replace(start, state=fresh, trusted=True)
-        solution = fit_appearance(capture, settings, start=start, keep_start=keep_start, least=MOVES)
+            start, keeps_start, shapes = replace(start, state=fresh, trusted=True), False, True
+        how = {"least": FINE_MOVES if fine else MOVES, "shapes": settings.specular and shapes}
+        solution = fit_appearance(capture, settings, start=start, keep_start=keeps_start, **how)
         errors = solution.frame_errors[~capture.fitted]
         return Trial(model, solution, errors, time.perf_counter() - begun)
 

@@ -18,7 +18,7 @@ from shared.solve.ladder_gloss import POOLING, VARIATIONS, Gloss, GlossLadder, s
 from shared.solve.reshape import reshape
 from shared.solve.shape import Reflectance, ShapeSettings
 
-CLIMB_SIZES = Sizes(points=600, directions=512, nodes=200)
+CLIMB_SIZES = Sizes(points=600, directions=768, nodes=200)
 CLIMB_FRAMES, CLIMB_HOLD_OUT = 36, 3
 """Frames that the ladder looks at, and which share of them judges: one in so many, and all that are held out anyway."""
 

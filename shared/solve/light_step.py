@@ -31,9 +31,9 @@ texel that wants to go dark may fall further, and must not slow the others down.
 _SETTLED = 0.03
 """The scale follows the highlights once a step changes the log roughness by no more."""
 
-PRECISION, PRECISION_OF_SEVERAL = (20, 0.01), (60, 0.002)
-"""Most products of a step, and by how much its residual must fall. One light's errors against another's, with an albedo
-between them, are what the samples tell least of, and come last: steps that stop before leave them in the albedo."""
+PRECISION_OF_SEVERAL = (60, 0.002)
+"""Settings.precision where there are several lights. One light's errors against another's, with an albedo between them,
+are what the samples tell least of, and come last: steps that stop before leave them in the albedo."""
 
 
 def conjugate_gradients(
@@ -239,7 +239,8 @@ class LightStep:
             return change - gauge * (unit * change).sum(0)
 
         right = -level_transposed(self.gradient())
-        count, tolerance = PRECISION_OF_SEVERAL if len(self.solver.light_frames) > 1 else PRECISION
+        several = len(self.solver.light_frames) > 1
+        count, tolerance = PRECISION_OF_SEVERAL if several else self.solver.settings.precision
         solved = conjugate_gradients(
             lambda x: level_transposed(self.product(level(x))), right, count, tolerance
         )
