@@ -112,7 +112,7 @@ class SurfaceViewer:
         return viewer, np.searchsorted(chosen, index)
 
     def view(self, camera_from_head: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]) -> View:
-        """All vertices in one camera. size: (width, height) of the picture in pixels."""
+        """All vertices, or those that it is limited to, in one camera. size: (width, height) of the picture, pixels."""
         vertices, normals = self._vertices, self._normals
         pixels, depth = project(vertices, camera_from_head, intrinsics)
         centre = -camera_from_head[:3, 3] @ camera_from_head[:3, :3]

@@ -111,14 +111,21 @@ def test_the_camera_sees_the_front_of_a_ball():
     assert np.allclose(view.depth, 400.0 - ball.vertices[:, 2])
 
 
-def test_what_lies_behind_an_edge_is_left_out_with_a_margin():
-    """A plate 50 mm before a wall hides part of it; wall vertices next to its shadow are not trusted either."""
+BEFORE_THE_WALL = rigid(FACING, np.array([0, 0, 450.0])), LENS, (160, 120)
+
+
+def plate_before_wall():
+    """A wall, of which a plate 50 mm before it hides part, and a viewer of both."""
     wall, plate = grid_plane(41, 80.0), grid_plane(9, 30.0)
     vertices = np.concatenate([wall.vertices, plate.vertices + [0, 0, 50.0]])
-    faces = np.concatenate([wall.faces, plate.faces + len(wall.vertices)])
-    mesh = wall.replace(vertices=vertices, faces=faces)
-    viewer = SurfaceViewer(mesh, RayScene(vertices, faces), margin_mm=4.0)
-    view = viewer.view(rigid(FACING, np.array([0, 0, 450.0])), LENS, (160, 120))
+    mesh = wall.replace(vertices=vertices, faces=np.concatenate([wall.faces, plate.faces + len(wall.vertices)]))
+    return wall, SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces), margin_mm=4.0)
+
+
+def test_what_lies_behind_an_edge_is_left_out_with_a_margin():
+    """Wall vertices next to the plate's shadow are not trusted either."""
+    wall, viewer = plate_before_wall()
+    view = viewer.view(*BEFORE_THE_WALL)
     reach = np.abs(wall.vertices[:, :2]).max(1)
     shadow = 15.0 * 450.0 / 400.0
     on_wall = view.weight[: len(wall.vertices)]
@@ -130,14 +137,10 @@ def test_what_lies_behind_an_edge_is_left_out_with_a_margin():
 
 def test_a_view_of_some_vertices_is_the_whole_view_there():
     """Also next to what hides them: the margin is that of the whole mesh."""
-    wall, plate = grid_plane(41, 80.0), grid_plane(9, 30.0)
-    vertices = np.concatenate([wall.vertices, plate.vertices + [0, 0, 50.0]])
-    mesh = wall.replace(vertices=vertices, faces=np.concatenate([wall.faces, plate.faces + len(wall.vertices)]))
-    viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces), margin_mm=4.0)
+    wall, viewer = plate_before_wall()
     index = np.arange(0, len(wall.vertices), 7)[::-1]
     limited, rows = viewer.limited_to(index)
-    camera = rigid(FACING, np.array([0, 0, 450.0])), LENS, (160, 120)
-    whole, part = viewer.view(*camera), limited.view(*camera)
+    whole, part = viewer.view(*BEFORE_THE_WALL), limited.view(*BEFORE_THE_WALL)
     assert len(part.weight) < len(whole.weight)
     assert 0.1 < (whole.weight[index] == 0).mean() < 0.9
     for name, values in vars(whole).items():

@@ -1,4 +1,4 @@
-"""The chart of speed against accuracy: its cases, its measuring, its table, its pictures."""
+"""The chart of speed against accuracy: its cases, its measuring, its table."""
 
 import csv
 import shutil
@@ -6,8 +6,8 @@ import sys
 
 import numpy as np
 import pytest
-from browser import Browser, chromium
 from toy_runs import TOY, make_subject
+from toy_tradeoff import ERROR, LIKENESS, POINTS
 
 from shared.contract.confine import trust
 from shared.contract.pipeline import load_pipeline
@@ -18,29 +18,11 @@ from tools import chart, tradeoff_runs
 from tools.goldens import TINY_SUBJECT
 from tools.score import camera_intrinsics, score
 from tools.tradeoff_cases import ABLATIONS, GROUPS, PEER, PRESET, QUICK, ChartCase, all_cases, chosen_cases
-from tools.tradeoff_page import tradeoff_page
 from tools.tradeoff_rows import Rows, csv_row, higher_is_better, pareto_front, row_costs, summarise
 from tools.tradeoff_runs import Cost, Runs, Solved, fingerprints, measured
 from tools.tradeoff_scores import flat, scores_of
-from tools.tradeoff_svg import Scale, log_ticks, tradeoff_svg
 
-ERROR, LIKENESS = "albedo.aligned.delta_e2000_median", "albedo.aligned.psnr_linear"
 CLIP = {"frames": 48, "height": 400}
-
-
-def point(name, seconds, error, group="ablation", **more):
-    ranges = {"seconds": [0.9 * seconds, 1.1 * seconds], "peak_mb": [500.0, 500.0]}
-    return {
-        "name": name, "group": group, "settings": [name], "repeats": 2, "seconds": seconds, "cpu_seconds": 2 * seconds,
-        "peak_mb": 500.0, "others": 0.0, "ranges": ranges,
-        "stages": {"inverse_render": seconds}, "scores": {ERROR: error, LIKENESS: 40.0 - error}, **more,
-    }  # fmt: skip
-
-
-POINTS = [
-    point("draft", 60.0, 2.0, PRESET), point("standard", 300.0, 1.0, PRESET), point("fine", 900.0, 1.1, PRESET),
-    point("draft, matte", 40.0, 2.5), point("draft, no bounce", 70.0, 2.2), point("Mitsuba, 120 s", 160.0, 3.0, PEER),
-]  # fmt: skip
 
 
 # ---------------------------------------------------------------- cases
@@ -204,41 +186,6 @@ def test_scores_become_flat():
     albedo = {"gain": [1.0, 2.0], "raw": {"psnr": 30.123456789}}
     nested = {"subject": "x", "albedo": albedo, "frames": 3, "bad": float("nan")}
     assert flat(nested) == {"albedo.gain.0": 1.0, "albedo.gain.1": 2.0, "albedo.raw.psnr": 30.12346, "frames": 3.0}
-
-
-# ---------------------------------------------------------------- the pictures
-def test_the_axis_is_logarithmic():
-    scale = Scale(1.0, 1000.0, 0.0, 300.0, logarithmic=True)
-    assert [round(scale(value)) for value in (1, 10, 100, 1000, 5000)] == [0, 100, 200, 300, 300]
-    assert log_ticks(3.0, 60.0) == [5.0, 10.0, 20.0, 50.0]
-
-
-def test_the_picture_names_the_presets_and_the_front():
-    svg = tradeoff_svg(POINTS, ERROR, "error")
-    assert svg.count("<circle") == len(POINTS) + 3
-    for name in ("draft", "standard", "fine"):
-        assert 'class="preset" x=' in svg and f">{name}</text>" in svg
-    assert ">matte</text>" in svg and 'class="front"' in svg
-    assert "http" not in svg.replace('xmlns="http://www.w3.org/2000/svg"', "")
-
-
-@pytest.mark.skipif(chromium() is None, reason="needs Chromium on the path or in LIMN_CHROMIUM")
-def test_the_page_answers(tmp_path):
-    path = tmp_path / "chart.html"
-    path.write_text(tradeoff_page(POINTS, ERROR, "a </script> clip", GROUPS), encoding="utf-8")
-    with Browser(1000, 900) as page:
-        page.open(path)
-        assert page.evaluate("document.querySelectorAll('#chart circle').length") == len(POINTS)
-        front = "[...document.querySelectorAll('#rows tr.front td:first-child')].map(c => c.textContent).join()"
-        assert page.evaluate(front) == "draft, matte,draft,standard"
-        page.evaluate("at('cost').value = 'peak_mb'; at('cost').dispatchEvent(new Event('change'))")
-        assert page.evaluate(front) == "standard"
-        page.click("#rows tr:nth-child(2)")
-        chosen = page.evaluate("document.querySelector('tr.chosen td').textContent")
-        assert page.evaluate("document.getElementById('about').textContent").startswith(chosen)
-        page.click("#groups input")
-        assert page.evaluate("document.querySelectorAll('#chart circle').length") == len(POINTS) - 3
-        assert page.problems == [] and page.requests == [path.resolve().as_uri()]
 
 
 # ---------------------------------------------------------------- the scores

@@ -139,7 +139,8 @@ class Ladder:
             self.begin(Model(**{part: names[0] for part, names in self.rungs.items()}))
             self.report(describe("start", ", ".join(self.present.model), self.present))
         self._climb_parts()
-        if self.present.model.visibility == "off" != self.rungs["visibility"][-1] and self._leap():
+        shadows_did_not_serve = self.present.model.visibility == "off" and self.rungs["visibility"][-1] != "off"
+        if shadows_did_not_serve and self._leap():
             self._climb_parts()
         return self.present
 
