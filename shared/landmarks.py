@@ -160,13 +160,27 @@ class FaceNetworks:
         # cv2 counts pixel centres from 0.0, we from 0.5: shift on both sides.
         warp = image_from_crop.copy()
         warp[:, 2] += warp[:, :2] @ (0.5, 0.5) - 0.5
-        crop = cv2.warpAffine(rgb, warp, (LANDMARK_SIZE, LANDMARK_SIZE), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-        values, logit = _forward(self._landmarks, crop.astype(np.float32) / 255, (LANDMARK_COUNT * 3, 1))
+        crop = _warped(rgb, warp, LANDMARK_SIZE)
+        values, logit = _forward(self._landmarks, crop, (LANDMARK_COUNT * 3, 1))
         points = values.reshape(LANDMARK_COUNT, 3).astype(np.float64)
         scale = float(np.sqrt(np.linalg.det(image_from_crop[:, :2])))
         points[:, :2] = points[:, :2] @ image_from_crop[:, :2].T + image_from_crop[:, 2]
         points[:, 2] *= scale
         return float(_sigmoid(logit)[0]), points
+
+
+def _warped(rgb: np.ndarray, image_from_crop: np.ndarray, size: int) -> np.ndarray:
+    """float32 [size, size, 3] in [0, 1]: the picture (uint8) under an affine map [2, 3] of integer-centred pixels.
+
+    In floating point: 8-bit results round the other way on other processors, which moves landmarks by 0.01 px.
+    """
+    corners = np.array([[0, 0, 1], [size, 0, 1], [0, size, 1], [size, size, 1]]) @ image_from_crop.T
+    height, width = rgb.shape[:2]
+    low = np.clip(np.floor(corners.min(0)).astype(int) - 1, 0, (width - 1, height - 1))
+    high = np.clip(np.ceil(corners.max(0)).astype(int) + 2, low + 1, (width, height))
+    part = rgb[low[1] : high[1], low[0] : high[0]].astype(np.float32) / 255
+    part_from_crop = image_from_crop - np.column_stack([np.zeros((2, 2)), low])
+    return cv2.warpAffine(part, part_from_crop, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
 
 def _load(path: Path) -> cv2.dnn.Net:

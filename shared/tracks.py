@@ -32,7 +32,7 @@ def local_contrast(grey: np.ndarray, sigma_px: float, spread_px: float, floor: f
 
     sigma_px and spread_px: reach of the mean and of the spread; floor: spread of log radiance below which is noise.
     """
-    log = np.log(grey.astype(np.float32) + 8.0)
+    log = np.log(np.arange(256) + 8.0).astype(np.float32)[grey]  # of doubles: single ones differ by the processor
     detail = log - cv2.GaussianBlur(log, (0, 0), sigma_px)
     spread = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), spread_px)) + floor
     return np.clip(np.rint(detail / spread * 45.0 + 128.0), 0, 255).astype(np.uint8)
@@ -65,9 +65,10 @@ class SurfaceGrid:
     scale: float
 
     def warp(self, values: np.ndarray) -> np.ndarray:
-        """Vertex values [V, C] -> [h, w, C] float32."""
-        taken = values.astype(np.float32)[self.corners]
-        return np.einsum("hwkc,hwk->hwc", taken, self.bary)
+        """Vertex values [V, C] -> [h, w, C] float32, rounded once: sums in single precision end differently by the
+        processor, and 8-bit pictures sampled there then differ by a code."""
+        taken = values.astype(np.float64)[self.corners]
+        return np.einsum("hwkc,hwk->hwc", taken, self.bary.astype(np.float64)).astype(np.float32)
 
 
 def grid_from_landmarks(landmarks_px: np.ndarray, reference: int, scale: float) -> SurfaceGrid:

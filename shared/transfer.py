@@ -81,25 +81,35 @@ def mesh_points(mesh: Mesh, index: np.ndarray | slice = slice(None)) -> Points:
 def spread_vertices(vertices: np.ndarray, count: int, allowed: np.ndarray | None = None) -> np.ndarray:
     """Indices of at most count vertices, spread evenly over the area: one per occupied cell of a voxel grid.
 
-    vertices [V, 3]; allowed [V] bool or None. The cell size is found by bisection; within a cell the vertex nearest to
-    the cell's mean wins, so the choice is deterministic.
+    vertices [V, 3]; allowed [V] bool or None. The cells are the smallest of a ladder of sizes that no more than count
+    of are occupied; within a cell the vertex nearest to the cell's mean wins, of equally near ones the first: two in a
+    cell always are. Sizes found by bisection would end where a vertex crosses from one cell to the next, so that a
+    vertex that moved by a rounding would change all the others.
     """
     candidates = np.arange(len(vertices)) if allowed is None else np.nonzero(allowed)[0]
     if len(candidates) <= count:
         return candidates
     points = vertices[candidates]
-    low, high = 1e-3, float(np.ptp(points, axis=0).max())
-    for _ in range(30):
-        cell = 0.5 * (low + high)
-        occupied = len(np.unique(_cells(points, cell)))
-        low, high = (cell, high) if occupied > count else (low, cell)
-    cells, inverse = np.unique(_cells(points, high), return_inverse=True)
+    low, high = 0, 1  # rungs of the ladder: too many cells, few enough
+    while len(np.unique(_cells(points, _cell_size(high)))) > count:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        fits = len(np.unique(_cells(points, _cell_size(middle)))) <= count
+        low, high = (low, middle) if fits else (middle, high)
+    edge = _cell_size(high)
+    cells, inverse = np.unique(_cells(points, edge), return_inverse=True)
     size = np.bincount(inverse)
     mean = np.stack([np.bincount(inverse, points[:, k]) / size for k in range(3)], axis=1)
-    distance = ((points - mean[inverse]) ** 2).sum(1)
-    order = np.lexsort((distance, inverse))
+    distance = np.rint(((points - mean[inverse]) ** 2).sum(1) / (1e-3 * edge) ** 2)
+    order = np.lexsort((np.arange(len(points)), distance, inverse))
     first = np.searchsorted(inverse[order], np.arange(len(cells)))
     return np.sort(candidates[order[first]])
+
+
+def _cell_size(rung: int) -> float:
+    """Edge of a cell in mm, from 1 um on in steps of 0.5 %."""
+    return 1e-3 * 1.005**rung
 
 
 def _cells(points: np.ndarray, size: float) -> np.ndarray:

@@ -22,7 +22,7 @@ from shared.errors import LimnError
 
 STAGE = Stage(
     name="export_usd",
-    version=3,
+    version=4,
     help="The head as USD, glTF, OBJ and EXR, with a report to judge it by.",
     inputs=("sample_frames", "track_landmarks", "init_albedo", "inverse_render"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -239,8 +239,10 @@ def run(job: Job) -> None:
     from shared.io.frames import FrameSet
     from shared.io.images import read_exr
     from shared.io.meshes import load_mesh
+    from shared.processor import use_baseline_opencv
     from shared.report.build import Result, result_report
 
+    use_baseline_opencv()
     start, solved = time.perf_counter(), job.input("inverse_render")
     frames = FrameSet.open(job.input("sample_frames"))
     mesh, poses = load_mesh(solved / "mesh.npz"), load_arrays(solved / "poses.npz")

@@ -15,7 +15,7 @@ from shared.errors import LimnError
 
 STAGE = Stage(
     name="init_albedo",
-    version=1,
+    version=2,
     help="The clip averaged on the head's texture map, and one colour per face segment.",
     inputs=("sample_frames", "track_landmarks"),
     outputs=(
@@ -90,8 +90,10 @@ def run(job: Job) -> None:
     from shared.io.arrays import write_json
     from shared.io.clip_inputs import read_inputs
     from shared.io.images import write_exr, write_png
+    from shared.processor import use_baseline_opencv
     from shared.texels import TexelSurface
 
+    use_baseline_opencv()
     inputs = read_inputs(job.input("sample_frames"), job.input("track_landmarks"))
     mesh = inputs.mesh
     surface, viewer = TexelSurface(mesh, job.params.size), SurfaceViewer.of(mesh)

@@ -34,7 +34,7 @@ LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 STAGE = Stage(
     name="inverse_render",
-    version=18,
+    version=19,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -216,10 +216,12 @@ def run(job: Job) -> None:
 
     from shared.io.arrays import write_json
     from shared.io.clip_inputs import read_mean_texture
+    from shared.processor import use_baseline_opencv
     from shared.solve.inverse import solve_clip, summarise
     from shared.solve.inverse_parameters import read_settings
     from shared.solve.joint_clips import join_clips
 
+    use_baseline_opencv()
     clips = read_clips(job)
     inputs, placed = clips[0], []
     if job.clips:

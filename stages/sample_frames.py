@@ -20,7 +20,7 @@ from shared.errors import InputError, LimnError
 
 STAGE = Stage(
     name="sample_frames",
-    version=3,
+    version=4,
     help="Decode the clip, choose good frames evenly in time, crop them to the head and mask the person.",
     inputs=(),
     outputs=(
@@ -52,8 +52,10 @@ def run(job: Job) -> None:
     from shared.io.cameras import source_intrinsics
     from shared.io.models import load_face_networks
     from shared.io.video import open_video
+    from shared.processor import use_baseline_opencv
     from shared.solve.sample_clip import select_frames, survey_clip
 
+    use_baseline_opencv()
     subject, params = job.subject, job.params
     reader, networks = open_video(subject.video), load_face_networks()
     info = reader.info

@@ -17,7 +17,7 @@ from shared.contract import Job, Output, Parameter, Stage, main
 
 STAGE = Stage(
     name="track_landmarks",
-    version=6,
+    version=7,
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
     given=("landmarks", "poses"),
@@ -218,8 +218,10 @@ def run(job: Job) -> None:
     from shared.io.frames import FrameSet
     from shared.io.given_tracking import read_given_poses
     from shared.io.models import load_head_model
+    from shared.processor import use_baseline_opencv
     from shared.solve.track_head import track_head
 
+    use_baseline_opencv()
     frames, model = FrameSet.open(job.input("sample_frames")), load_head_model().subdivided()
     landmarks_px, presence = read_landmarks(job, frames)
     given_poses = None

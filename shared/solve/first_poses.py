@@ -42,6 +42,10 @@ LANDMARK_PRIOR_MM, FLOW_PRIOR_MM = 5.0, 2.5
 LANDMARK_REACH = 0.08
 """Landmarks off by more than this share of the face's width don't count."""
 
+SAME_VIEW = 0.02
+"""Views that lie as near to each other as this share of the motion are the same: the first one serves. A head that
+turns and comes back passes each view twice, and which of the two is nearer by a hair is chance."""
+
 LOSS = 2.0
 """Cauchy scale in units of the noise."""
 
@@ -142,6 +146,7 @@ def choose_references(camera_from_points: np.ndarray, count: int) -> list[int]:
     mean = normalised(directions.mean(0))
     spread = directions - directions @ mean[:, None] * mean
     axes = np.linalg.svd(spread - spread.mean(0), full_matrices=False)[2][:2]
+    axes *= np.sign(axes[[0, 1], np.abs(axes).argmax(1)])[:, None]  # their signs are the library's choice
     along = spread @ axes.T
     middle = np.median(along, axis=0)
     targets = [middle]
@@ -150,7 +155,9 @@ def choose_references(camera_from_points: np.ndarray, count: int) -> list[int]:
             target = middle.copy()
             target[axis] += 0.55 * (end - middle[axis])
             targets.append(target)
-    chosen = [int(np.argmin(((along - target) ** 2).sum(1))) for target in targets[:count]]
+    distances = [np.linalg.norm(along - target, axis=1) for target in targets[:count]]
+    reach = SAME_VIEW * np.ptp(along[:, 0])
+    chosen = [int(np.argmax(distance <= distance.min() + reach)) for distance in distances]
     return list(dict.fromkeys(chosen))
 
 

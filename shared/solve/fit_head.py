@@ -140,7 +140,9 @@ def _code_step(model, fit, points, landmarks, known, weights, usable, reach_mm) 
     matrix, target = np.concatenate(rows), np.concatenate(rhs)
     normal = matrix.T @ matrix + 1e-9 * np.eye(7 + codes)
     factor = np.linalg.cholesky(normal).T
-    solved = lsq_linear(factor, np.linalg.solve(factor.T, matrix.T @ target), (lower, upper), max_iter=60).x
+    right = np.linalg.solve(factor.T, matrix.T @ target)
+    # by active sets, to the last digit: an interior point stops near the bounds, where is chance
+    solved = lsq_linear(factor, right, (lower, upper), method="bvls", tol=1e-13).x
     return _moved(model, fit, solved, centre)
 
 
