@@ -2,9 +2,10 @@
 
     python tests/fault_matrix.py [--kills 40] [--toy] [--seed 0] [--json FILE] [FAULT ...]
 
-FAULT: kill, disk_full, read_only, clock, two_runs, half_manifest, flipped_bit (all). Each must leave the source as it
-was and, after at most one more run, exactly the results of the undisturbed run. disk_full and read_only mount a tmpfs,
-clock compiles jumping_clock.c: where that is impossible they say so and are left out. Exit code 1 for wrong results.
+FAULT: by_hand, kill, disk_full, read_only, clock, two_runs, half_manifest, flipped_bit (all). Each must leave the
+source as it was and, after at most one more run, exactly the results of the undisturbed run. by_hand runs each stage
+without the workflow. disk_full and read_only mount a tmpfs, clock compiles jumping_clock.c: where that is impossible
+they say so and are left out. Exit code 1 for wrong results.
 """
 
 from __future__ import annotations
@@ -25,11 +26,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-from quick import QUICK, TINY  # noqa: E402
+from quick import SETTINGS, TINY  # noqa: E402
 from toy_runs import copy_pipeline, make_subject  # noqa: E402
 
 from shared.contract.declare import folder_of  # noqa: E402
-from shared.contract.pipeline import load_pipeline  # noqa: E402
+from shared.contract.interpreter import settled_environment  # noqa: E402
+from shared.contract.pipeline import REPOSITORY, load_pipeline  # noqa: E402
 
 DISK_MB = 600
 
@@ -41,14 +43,15 @@ class Bench:
         self.scratch, self.rng = scratch, rng
         self.subject = scratch / "anna"
         if toy:
-            pipeline = copy_pipeline(scratch / "toy")
+            self.pipeline = load_pipeline(copy_pipeline(scratch / "toy"))
             make_subject(self.subject)
-            self.arguments = ["--pipeline", pipeline, "--set", "count_words.pause_s=1"]
+            self.settings = ["count_words.pause_s=1"]
         else:
-            pipeline = None
+            self.pipeline = load_pipeline()
             shutil.copytree(TINY, self.subject, ignore=shutil.ignore_patterns("gt"))
-            self.arguments = [*QUICK]
-        self.stages = list(load_pipeline(pipeline).steps)
+            self.settings = [*SETTINGS]
+        self.arguments = ["--pipeline", self.pipeline.path, *(f"--set={setting}" for setting in self.settings)]
+        self.stages = list(self.pipeline.steps)
         self.source = contents(self.subject)
         self.reference = scratch / "reference" / "anna"
         start = time.monotonic()
@@ -64,6 +67,12 @@ class Bench:
         """`limn run` with its results under out/anna."""
         return [sys.executable, "-m", "tools.limn", "run", *map(str, (self.subject, "--out", out, "--cores", 1,
                                                                       *self.arguments))]
+
+    def by_hand(self, stage: str, out: Path) -> list[str]:
+        """The same of one stage, without the workflow."""
+        own = [f"--set={setting}" for setting in self.settings if setting.startswith(f"{stage}.")]
+        return [sys.executable, "-m", f"{self.pipeline.package}.{stage}", *map(str, (
+            "--subject", self.subject, "--out", out, "--pipeline", self.pipeline.path, "--threads", 1, *own))]
 
     def start(self, out: Path, **environment: str) -> subprocess.Popen:
         """The command, running."""
@@ -139,6 +148,24 @@ def half_published(run: Path, stages: list[str]) -> list[str]:
     """Stage folders that are there without being whole."""
     return [f"{name} is half there" for name in stages
             if (run / folder_of(name)).exists() and not (run / folder_of(name) / "manifest.json").is_file()]
+
+
+def by_hand(bench: Bench, out: Path, number: int) -> list[str]:
+    """Every stage by hand, where nobody set threads before: the same bytes, the manifests' too, in every second case
+    under settings of the user's own."""
+    others = {"OMP_NUM_THREADS": "7", "OPENBLAS_NUM_THREADS": "7", "MKL_CBWR": "AVX2", "PYTHONHASHSEED": "7"}
+    own = others if number % 2 else {}
+    kept = {name: value for name, value in os.environ.items() if name not in settled_environment(1)}
+    search = os.pathsep.join([str(bench.pipeline.root), str(REPOSITORY)])
+    for stage in bench.stages:
+        done = subprocess.run(bench.by_hand(stage, out), env={**kept, **own, "PYTHONPATH": search}, text=True,
+                              capture_output=True, check=False)
+        if done.returncode != 0:
+            return [f"{stage} ended with {done.returncode}: {done.stderr.splitlines()[-1:]}"]
+    return bench.wrong(out) + [
+        f"{name}/manifest.json differs" for name in bench.stages
+        if (out / "anna" / folder_of(name) / "manifest.json").read_bytes()
+        != (bench.reference / folder_of(name) / "manifest.json").read_bytes()]
 
 
 def kill(bench: Bench, out: Path, number: int) -> list[str]:
@@ -306,9 +333,9 @@ def can_mount() -> bool:
 
 
 FAULTS: dict[str, tuple[Callable[[Bench, Path, int], list[str]], int, str]] = {
-    "kill": (kill, 40, ""), "disk_full": (disk_full, 5, "mount"), "read_only": (read_only, 2, "mount"),
-    "clock": (clock, 2, "cc"), "two_runs": (two_runs, 3, ""), "half_manifest": (half_manifest, 5, ""),
-    "flipped_bit": (flipped_bit, 5, ""),
+    "by_hand": (by_hand, 2, ""), "kill": (kill, 40, ""), "disk_full": (disk_full, 5, "mount"),
+    "read_only": (read_only, 2, "mount"), "clock": (clock, 2, "cc"), "two_runs": (two_runs, 3, ""),
+    "half_manifest": (half_manifest, 5, ""), "flipped_bit": (flipped_bit, 5, ""),
 }
 
 

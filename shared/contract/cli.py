@@ -18,6 +18,7 @@ from shared.contract.disk import disk_fault
 from shared.contract.execute import execute
 from shared.contract.folders import RunFolder
 from shared.contract.hashing import HashMemory
+from shared.contract.interpreter import set_threads, settle
 from shared.contract.job import Job
 from shared.contract.needs import amount, measured_scale, scale_of
 from shared.contract.pipeline import Pipeline, load_pipeline, split_settings
@@ -26,7 +27,6 @@ from shared.contract.subject import Subject, load_subject
 from shared.errors import InputError
 
 _LOCK_WAIT_S = 10.0
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,16 @@ class Request:
 
 def main(stage: Stage, run: Callable[[Job], None], check: Callable[[Job], None] | None = None,
          argv: Sequence[str] | None = None) -> int:
-    """Runs the stage unless its result is current; returns the exit code."""
+    """Runs the stage unless its result is current; returns the exit code.
+
+    argv: None for the command line of this process, which may then start anew, see interpreter.py.
+    """
     events = None
     try:
         request = parse_request(stage, argv)
         events = request.events
+        if argv is None:
+            settle(request.threads)
         with request.run.locked(stage.name, _LOCK_WAIT_S):
             request.run.remove_leftovers(stage.name)
             if answer_current(request):
@@ -152,22 +157,3 @@ def _disk_needed(pipeline: Pipeline, stage: Stage, preset: str | None, run: RunF
     parameters = {name: pipeline.parameters(other, preset, {}) for name, other in pipeline.stages.items()}
     expected = scale_of(pipeline.sizes, pipeline.stages, parameters, str(pipeline.path))
     return 1.1 * amount(step.resources, "disk_mb", measured_scale(run.root, expected))
-
-
-def set_threads(count: int) -> None:
-    """Limits the libraries to so many threads; sums then run in one order.
-
-    Idle OpenMP threads sleep: spinning ones stall each other for minutes when anything else wants the cores. MKL's
-    matrix products depend on where the arrays lie in memory unless it is told to be reproducible. OpenBLAS, which numpy
-    and scipy use, has one thread whatever the count: on matrices as small as theirs here, two take twice the processor
-    time and end no sooner; and the tracking's sums no longer depend on the number of cores.
-    """
-    for name in _THREAD_VARIABLES:
-        os.environ[name] = str(count)
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    os.environ.setdefault("MKL_CBWR", "COMPATIBLE")
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(count)
-    if "cv2" in sys.modules:
-        sys.modules["cv2"].setNumThreads(count)

@@ -1,8 +1,8 @@
 """Starts a stage for the workflow: `python -m shared.contract.launch FOLDER PACKAGE NAME [stage arguments]`.
 
 Ties the process to its parent, so that a stage never outlives a killed workflow; answers at once where the stage's
-result is current, without loading what the stage needs; else goes on as `python -m PACKAGE.NAME`, in a new interpreter
-only where this one orders its sets by chance.
+result is current, without loading what the stage needs; else goes on as `python -m PACKAGE.NAME`, with the threads set
+before anything numeric is loaded.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ import signal
 import sys
 from pathlib import Path
 
-from shared.contract.cli import answer_current, parse_request, report_input_error, set_threads
+from shared.contract.cli import answer_current, parse_request, report_input_error
+from shared.contract.interpreter import settle
 from shared.contract.pipeline import REPOSITORY
 from shared.contract.source import read_declaration
 from shared.errors import InputError
@@ -67,16 +68,12 @@ def main() -> int:
     except InputError as error:
         report_input_error(name, error, request.events)
         return 2
-    set_threads(request.threads)
+    settle(request.threads)
     search = [folder, str(REPOSITORY)]
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [*search, os.environ.get("PYTHONPATH", "")]))
-    module = f"{package}.{name}"
-    if sys.flags.hash_randomization:
-        os.environ["PYTHONHASHSEED"] = "0"
-        os.execv(sys.executable, [sys.executable, "-m", module, *arguments])
     sys.path[:0] = search
     sys.argv[1:] = arguments
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    runpy.run_module(f"{package}.{name}", run_name="__main__", alter_sys=True)
     return 0
 
 
