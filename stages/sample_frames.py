@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from shared.contract import Job, Output, Parameter, Stage, main
+from shared.contract.models import FACE_NETWORKS
 from shared.errors import InputError, LimnError
 
 STAGE = Stage(
@@ -23,6 +24,7 @@ STAGE = Stage(
     version=4,
     help="Decode the clip, choose good frames evenly in time, crop them to the head and mask the person.",
     inputs=(),
+    models=FACE_NETWORKS,
     outputs=(
         Output("frames.json", "frames with their times, the crop and its camera, dropped frames with the reason"),
         Output("frames/*.png", "the crop in the source's code values", space="crop", colour_space="source"),

@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from shared.contract import Job, Output, Parameter, Stage, main
+from shared.contract.models import FACE_NETWORKS, HEAD_MODEL_FILE
 
 STAGE = Stage(
     name="track_landmarks",
@@ -21,6 +22,7 @@ STAGE = Stage(
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
     given=("landmarks", "poses"),
+    models=(*FACE_NETWORKS, HEAD_MODEL_FILE),
     outputs=(
         Output("poses.npz", "camera_from_head [F, 4, 4], covariance [F, 6, 6], frame_index, intrinsics", unit="mm"),
         Output("mesh.npz", "the fitted head with its UVs and face segments", unit="mm", space="head"),

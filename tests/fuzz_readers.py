@@ -23,6 +23,7 @@ import atheris
 with atheris.instrument_imports(include=["shared", "tools", "yaml", "zipfile", "numpy.lib", "json"]):
     import numpy as np
 
+    from shared.contract.drift import drift
     from shared.contract.hashing import HashMemory
     from shared.contract.manifest import Work, damage, outputs_digest, read_manifest
     from shared.contract.pipeline import load_pipeline
@@ -59,11 +60,20 @@ def pipeline(data: bytes) -> None:
 def manifest(data: bytes) -> None:
     """manifest.json of a stage's folder that lies there."""
     (FOLDER / "manifest.json").write_bytes(data)
+    (FOLDER / "provenance.json").write_text("{}")
     found = read_manifest(FOLDER)
     if found is not None:
         Work("read_text", 1, {"a": 1}, 0, {"video": "0"}).reasons(found)
         outputs_digest(found)
         damage(FOLDER, found, HashMemory(FOLDER / "memory.json"))
+
+
+def provenance(data: bytes) -> None:
+    """provenance.json of a stage's folder that lies there."""
+    (FOLDER / "provenance.json").write_bytes(data)
+    damage(FOLDER, {"outputs": {"b": {"volatile": True}, "subject.yaml": {"volatile": True}}},
+           HashMemory(FOLDER / "memory.json"))
+    drift(FOLDER, (ROOT,))
 
 
 def events(data: bytes) -> None:
@@ -102,7 +112,7 @@ def as_npz(name: str, array: str, data: bytes) -> Path:
     return path
 
 
-READERS = {reader.__name__: reader for reader in (subject, pipeline, manifest, events, landmarks, poses)}
+READERS = {reader.__name__: reader for reader in (subject, pipeline, manifest, provenance, events, landmarks, poses)}
 
 
 def seeds(name: str) -> list[bytes]:
@@ -114,6 +124,8 @@ def seeds(name: str) -> list[bytes]:
         "pipeline": [(ROOT / "pipeline.yaml").read_text(), "stages:\n  sample_frames: {needs: [], threads: 1}\n"],
         "manifest": ['{"schema": 1, "stage": "a", "version": 1, "parameters": {"a": 1}, "seed": 0, "inputs": {}, '
                      '"outputs": {"subject.yaml": {"sha256": "0", "bytes": 3}, "b": {"volatile": true}}}'],
+        "provenance": ['{"python": "3.11.7", "packages": {"numpy": "2.4.6"}, "code": {"shared/brdf.py": "0"}, '
+                       '"volatile": {"b": {"sha256": "0", "bytes": 3}, "subject.yaml": {"sha256": "0", "bytes": 3}}}'],
         "events": ['{"kind": "started", "time": 1}\n{"kind": "progress", "time": 2, "label": "a", "done": 1, '
                    '"total": 3}\n{"kind": "failed", "time": 3, "message": "m", "log": "l", "last": []}\n'],
     }

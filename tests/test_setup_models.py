@@ -7,8 +7,9 @@ import subprocess
 import numpy as np
 import pytest
 
+from shared.contract.models import HEAD_MODEL_FILE, models_folder
 from shared.errors import InputError
-from shared.io.models import HEAD_MODEL_FILE, LIST_FILE, checked_path, load_head_model, models_folder, network_path
+from shared.io.models import LIST_FILE, checked_path, load_head_model, network_path
 from tools import check_host, setup_models
 from tools.head_model.relaxation import _derivatives, _energy, _rest_gradients, relax
 

@@ -41,7 +41,7 @@ class Settings:
     """How to run. parameters: {stage: {parameter: value}}. arguments: what hands them to each stage's command line.
 
     cores: in all, None for what a profile says. memory_mb: for all jobs together. threads: of one stage, None for an
-    even share of the cores. profile: a Snakemake profile.
+    even share of the cores. profile: a Snakemake profile. renew: do again what other code or packages made.
     """
 
     pipeline: Pipeline
@@ -53,6 +53,7 @@ class Settings:
     threads: int | None = None
     profile: str | None = None
     summary: Path | None = None
+    renew: bool = False
 
     def threads_of(self, stage: str, subjects: int) -> int:
         """Cores of one job, where so many subjects wait."""

@@ -74,6 +74,9 @@ def make_parser() -> argparse.ArgumentParser:
     for command in (run, plan, status, report):
         command.add_argument("--preset", help="a preset of pipeline.yaml")
         command.add_argument("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help="a parameter")
+    for command in (run, plan):
+        command.add_argument("--renew", action="store_true",
+                             help="do again what was made by other code or packages than those of today")
     for command in (plan, status):
         command.add_argument("--verify", action="store_true", help="read every published file again")
     run.add_argument("--cores", type=int, metavar="N", help="cores to use (all)")
@@ -141,12 +144,13 @@ def run_command(args: argparse.Namespace) -> int:
     given = split_settings(args.set, pipeline.stages)
     preset = [f"--preset={args.preset}"] if args.preset else []
     files = {(name, p.name) for name, stage in pipeline.stages.items() for p in stage.parameters if p.file}
-    arguments = {name: preset + [f"--set={key}={parameters[name][key] if (name, key) in files else value}"
+    always = preset + ["--renew"] * args.renew
+    arguments = {name: always + [f"--set={key}={parameters[name][key] if (name, key) in files else value}"
                                  for key, value in given.get(name, {}).items()]
                  for name in pipeline.stages}
     return run_cases(opened, Settings(
         pipeline, parameters, arguments, args.out, cores, memory_mb, args.threads, args.profile,
-        default_summary(args.subjects, args.out, args.summary)))
+        default_summary(args.subjects, args.out, args.summary), args.renew))
 
 
 def plan_command(args: argparse.Namespace) -> int:
@@ -217,7 +221,8 @@ def _for_each_plan(args: argparse.Namespace, show) -> int:
     parameters = all_parameters(pipeline, args.preset, args.set)
     opened = open_cases(find_subjects(args.subjects, args.list), args.out)
     for case in opened.cases:
-        show(case, plan_case(pipeline, case, parameters, getattr(args, "verify", False), drift=True))
+        show(case, plan_case(pipeline, case, parameters, getattr(args, "verify", False),
+                             getattr(args, "renew", False)))
     opened.all()
     return 0
 

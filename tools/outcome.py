@@ -13,7 +13,7 @@ from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
 from tools.cases import Case
 from tools.gates import PICTURE, Flag, judge
-from tools.plan import CURRENT, StagePlan
+from tools.plan import CURRENT, StagePlan, kept_lines
 from tools.watch import Track
 
 SCHEMA = 1
@@ -25,7 +25,7 @@ EXIT_CODES = {"done": 0, "review": 3, "input error": 2}
 class Outcome:
     """One subject. state: done, review (finished, but a quality gate is missed), input error, failed, killed,
     interrupted or not run. stage: where it stopped, or the last one. minutes, memory_mb, bytes: of its finished stages,
-    as they were measured when they ran.
+    as they were measured when they ran. kept: results that other code or packages made than those of today.
     """
 
     subject: str
@@ -41,6 +41,7 @@ class Outcome:
     picture: str = ""
     results: str = ""
     warnings: tuple[str, ...] = field(default=(), repr=False)
+    kept: tuple[str, ...] = field(default=(), repr=False)
 
 
 def exit_code(outcomes: Sequence[Outcome]) -> int:
@@ -59,7 +60,8 @@ def outcome_of(case: Case, pipeline: Pipeline, plans: Mapping[str, StagePlan], t
                interrupted: bool = False, engine_log: Path | None = None) -> Outcome:
     """What the plan after the run and the events of its stages say."""
     costs = costs_of(case, pipeline)
-    facts = {"subject": case.name, "folder": str(case.subject.folder), "results": str(case.run.root), **costs}
+    facts = {"subject": case.name, "folder": str(case.subject.folder), "results": str(case.run.root), **costs,
+             "kept": tuple(kept_lines(plans))}
     left = [name for name, plan in plans.items() if plan.state != CURRENT]
     if not left:
         flags = tuple(judge(case.run, pipeline))

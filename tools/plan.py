@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from shared.contract.declare import Stage
+from shared.contract.drift import drift
 from shared.contract.hashing import HashMemory
-from shared.contract.manifest import (
-    PROVENANCE,
-    damage,
-    file_inputs,
-    make_work,
-    outputs_digest,
-    read_manifest,
-    read_record,
-    source_inputs,
-)
-from shared.contract.pipeline import REPOSITORY, Pipeline
-from shared.contract.source import fingerprint
+from shared.contract.manifest import damage, make_work, outputs_digest, own_inputs, read_manifest
+from shared.contract.pipeline import Pipeline
 from tools.cases import Case
 
 CURRENT, RUNS, WAITS = "current", "will run", "may run"
-_SHOWN_FILES = 3
 
 
 @dataclass(frozen=True)
 class StagePlan:
-    """state: CURRENT; RUNS; WAITS, which means that it depends on what earlier stages will write. case: whose stage."""
+    """state: CURRENT; RUNS; WAITS, which means that it depends on what earlier stages will write. reasons: of a current
+    stage what has changed of the code and the packages that made it. case: whose stage."""
 
     name: str
     state: str
@@ -37,15 +28,15 @@ class StagePlan:
 
 
 def plan_case(pipeline: Pipeline, case: Case, parameters: Mapping[str, Mapping[str, object]],
-              verify: bool = False, drift: bool = False) -> dict[str, StagePlan]:
-    """{label of the stage: plan} in the pipeline's order. verify: read every published file again; drift: remark where
-    the code is another one than that which ran, for people: it takes a second to find out."""
+              verify: bool = False, renew: bool = False) -> dict[str, StagePlan]:
+    """{label of the stage: plan} in the pipeline's order. verify: read every published file again. renew: a stage runs,
+    too, where other code or packages made its result."""
     memory = HashMemory(case.run.memory, verify)
     plans: dict[str, StagePlan] = {}
     for part, name in case.jobs(pipeline):
         plan = _plan_stage(pipeline.stages[name], part, parameters[name], plans, memory)
-        if drift and plan.state == CURRENT:
-            plan = replace(plan, reasons=_drift(part, name))
+        if plan.state == CURRENT or renew and plan.state == WAITS:
+            plan = _with_drift(plan, drift(part.run.published(name), pipeline.code_roots), renew)
         plans[part.label(name)] = replace(plan, case=part)
     memory.save()
     return plans
@@ -58,7 +49,7 @@ def _plan_stage(stage: Stage, case: Case, parameters: Mapping[str, object], plan
     if manifest is None:
         reason = "its manifest is missing or damaged" if folder.is_dir() else "never ran"
         return StagePlan(stage.name, RUNS, (reason,))
-    inputs = source_inputs(stage, case.subject, memory) | file_inputs(stage, parameters, memory)
+    inputs = own_inputs(stage, case.subject, parameters, memory)
     needed = {name: case.label(name) for name in case.inputs(stage)}
     inputs |= {name: plans[label].digest for name, label in needed.items()}
     reasons = make_work(stage, parameters, inputs).reasons(manifest) or damage(folder, manifest, memory)
@@ -70,29 +61,17 @@ def _plan_stage(stage: Stage, case: Case, parameters: Mapping[str, object], plan
     return StagePlan(stage.name, CURRENT, (), outputs_digest(manifest))
 
 
-def _drift(case: Case, stage: str) -> tuple[str, ...]:
-    """A remark where code has changed since the stage ran although its version has not."""
-    provenance = read_record(case.run.published(stage) / PROVENANCE) or {}
-    recorded = provenance.get("code", {})
-    changed = [name for name, was in recorded.items()
-               if not (REPOSITORY / name).is_file() or _fingerprint(name) != was]
-    if not changed:
-        return ()
-    more = len(changed) - _SHOWN_FILES
-    shown = ", ".join(changed[:_SHOWN_FILES]) + (f" and {more} more" if more > 0 else "")
-    return (f"code changed since, its version did not: {shown}",)
+def _with_drift(plan: StagePlan, remarks: Sequence[str], renew: bool) -> StagePlan:
+    """The plan of a stage whose result other code or packages made: kept, or to be done again."""
+    if not remarks:
+        return plan
+    return replace(plan, state=RUNS, reasons=tuple(remarks), digest=None) if renew else replace(
+        plan, reasons=tuple(f"kept although {remark}" for remark in remarks))
 
 
-_fingerprints: dict[str, str] = {}
-
-
-def _fingerprint(name: str) -> str:
-    if name not in _fingerprints:
-        try:
-            _fingerprints[name] = fingerprint(REPOSITORY / name)
-        except SyntaxError:
-            _fingerprints[name] = ""
-    return _fingerprints[name]
+def kept_lines(plans: Mapping[str, StagePlan]) -> list[str]:
+    """One line for each current stage that other code or packages made."""
+    return [f"{label}: {reason}" for label, plan in plans.items() if plan.state == CURRENT for reason in plan.reasons]
 
 
 def plan_lines(case: Case, plans: Mapping[str, StagePlan]) -> list[str]:

@@ -12,7 +12,8 @@ from pathlib import Path
 
 from packaging.utils import canonicalize_name
 
-from shared.io.models import LIST_FILE, models_folder
+from shared.contract.models import models_folder
+from shared.io.models import LIST_FILE
 from tools.packages import ROOT, Package
 
 _EXPRESSION = re.compile(r"[A-Za-z0-9.-]+(\s+(AND|OR|WITH)\s+[A-Za-z0-9.-]+)*\Z")

@@ -17,9 +17,10 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from shared.contract.models import HEAD_MODEL_FILE, NETWORK_FILES, models_folder
 from shared.errors import InputError, LimnError
 from shared.io.arrays import save_arrays, write_json
-from shared.io.models import HEAD_MODEL_FILE, LIST_FILE, NETWORK_FILES, file_sha256, models_folder
+from shared.io.models import LIST_FILE, file_sha256
 from shared.landmarks import FaceNetworks
 from tools.head_model import VERSION
 from tools.head_model.build import build_head_model

@@ -23,7 +23,7 @@ from shared.errors import InputError
 from tools.cases import Case, InputErrors, Opened
 from tools.engine import SCRATCH, Settings, configure, run_engine, scratch_folder
 from tools.outcome import Outcome, at_fault, exit_code, outcome_of, write_summary
-from tools.plan import CURRENT, StagePlan, plan_case
+from tools.plan import CURRENT, StagePlan, kept_lines, plan_case
 from tools.summary import table_lines
 from tools.watch import Track, Watch
 
@@ -52,6 +52,7 @@ def run_cases(opened: Opened, settings: Settings) -> int:
         for case, plan in planned:
             if is_current(plan):
                 _say(f"{case.name}: current, nothing to do: {case.run.root}")
+                _say_kept(case, plan)
         ended = _run_waiting(waiting, settings, start) if waiting else {}
         outcomes = [at_fault(folder, error) for folder, error in faults]
         outcomes += [ended.get(case.name) or outcome_of(case, settings.pipeline, plan) for case, plan in planned]
@@ -76,7 +77,7 @@ def _begin(stack: contextlib.ExitStack, case: Case, settings: Settings) -> dict[
             clear_all_leftovers(case, settings.pipeline)
             for path in case.run.work.glob(f"{SCRATCH}*"):
                 shutil.rmtree(path, ignore_errors=True)
-            plan = plan_case(settings.pipeline, case, settings.parameters)
+            plan = plan_case(settings.pipeline, case, settings.parameters, renew=settings.renew)
             _renew_stamps(plan)
         except OSError as error:
             raise InputError("cannot be read or written", where=str(error.filename or case.run.root),
@@ -143,7 +144,7 @@ def _run_waiting(cases: Sequence[Case], settings: Settings, start: float) -> dic
 def _conclude(case: Case, tracks: Sequence[Track], settings: Settings, log: Path, seconds: float,
               interrupted: bool) -> Outcome:
     """Keeps the engine's log and says how the subject's run ended."""
-    plans = plan_case(settings.pipeline, case, settings.parameters)
+    plans = plan_case(settings.pipeline, case, settings.parameters, renew=settings.renew)
     kept = case.run.work / _WORKFLOW_LOG
     folders = [(plan.case.run.published(plan.name), plan.case.run.failed(plan.name)) for plan in plans.values()]
     if any(published.exists() or failed.exists() for published, failed in folders):
@@ -163,7 +164,17 @@ def _conclude(case: Case, tracks: Sequence[Track], settings: Settings, log: Path
     else:
         _say(f"{case.name}: {outcome.reason}" + (f"; its log: {outcome.log}" if outcome.log else "")
              + "; limn run again goes on there" * (outcome.state == "killed"))
+    _say_kept(case, plans)
     return outcome
+
+
+def _say_kept(case: Case, plans: Mapping[str, StagePlan]) -> None:
+    """Names the results that are kept although other code or packages made them."""
+    lines = kept_lines(plans)
+    for line in lines:
+        _say(f"{case.name}  {line}")
+    if lines:
+        _say(f"{case.name}: to have {'it' if len(lines) == 1 else 'them'} anew: limn run --renew")
 
 
 def _result(case: Case) -> Path:

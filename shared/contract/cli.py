@@ -15,13 +15,14 @@ from pathlib import Path
 from shared.contract.currency import reasons_to_run, work_to_do
 from shared.contract.declare import Stage
 from shared.contract.disk import disk_fault
+from shared.contract.drift import drift
 from shared.contract.execute import execute
 from shared.contract.folders import RunFolder
 from shared.contract.hashing import HashMemory
 from shared.contract.interpreter import set_threads, settle
 from shared.contract.job import Job
 from shared.contract.needs import amount, measured_scale, scale_of
-from shared.contract.pipeline import Pipeline, load_pipeline, split_settings
+from shared.contract.pipeline import REPOSITORY, Pipeline, load_pipeline, split_settings
 from shared.contract.progress import Reporter
 from shared.contract.subject import Subject, load_subject
 from shared.errors import InputError
@@ -31,7 +32,7 @@ _LOCK_WAIT_S = 10.0
 
 @dataclass(frozen=True)
 class Request:
-    """What one call of a stage asks for, checked."""
+    """What one call of a stage asks for, checked. roots: where the code lies whose changes are noticed."""
 
     stage: Stage
     subject: Subject
@@ -42,6 +43,8 @@ class Request:
     verify: bool
     events: Path | None
     disk_mb: float | None = None
+    renew: bool = False
+    roots: tuple[Path, ...] = (REPOSITORY,)
 
 
 def main(stage: Stage, run: Callable[[Job], None], check: Callable[[Job], None] | None = None,
@@ -87,11 +90,17 @@ def answer_current(request: Request) -> bool:
     work = work_to_do(request.stage, request.subject, request.run, request.parameters, memory)
     if reasons_to_run(work, request.run, memory):
         return False
+    by_hand = not request.events
+    remarks = drift(request.run.published(request.stage.name), request.roots) if request.renew or by_hand else []
+    if request.renew and remarks:
+        return False
     memory.save()
     request.run.write_stamp(request.stage.name)
     reporter = Reporter(request.stage.name, None, request.events)
     reporter.event("current")
     reporter.note(f"current: {request.run.published(request.stage.name)}")
+    for remark in remarks:
+        reporter.note(f"kept although {remark}; to have it anew: --renew")
     return True
 
 
@@ -113,6 +122,7 @@ def make_parser(stage: Stage) -> argparse.ArgumentParser:
     parser.add_argument("--pipeline", type=Path, metavar="FILE", help="another pipeline.yaml")
     parser.add_argument("--threads", type=int, metavar="N", help="cores to use (all)")
     parser.add_argument("--force", action="store_true", help="run even if the result is current")
+    parser.add_argument("--renew", action="store_true", help="run, too, if other code or packages made the result")
     parser.add_argument("--verify", action="store_true", help="read every file again to see whether it is current")
     parser.add_argument("--events", type=Path, help=argparse.SUPPRESS)
     return parser
@@ -134,7 +144,8 @@ def parse_request(stage: Stage, argv: Sequence[str] | None) -> Request:
     if subject.clips or args.clip is not None:
         subject, run = _part(stage, subject, run, args.clip, bool(stage.joins) or stage.name in pipeline.joint)
     disk_mb = _disk_needed(pipeline, stage, args.preset, run)
-    return Request(stage, subject, run, parameters, threads, args.force, args.verify, args.events, disk_mb)
+    return Request(stage, subject, run, parameters, threads, args.force, args.verify, args.events, disk_mb, args.renew,
+                   pipeline.code_roots)
 
 
 def _part(stage: Stage, subject: Subject, run: RunFolder, clip: str | None, joint: bool) -> tuple[Subject, RunFolder]:

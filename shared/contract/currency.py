@@ -10,11 +10,10 @@ from shared.contract.hashing import HashMemory
 from shared.contract.manifest import (
     Work,
     damage,
-    file_inputs,
     make_work,
     outputs_digest,
+    own_inputs,
     read_manifest,
-    source_inputs,
 )
 from shared.contract.subject import Subject
 from shared.errors import InputError
@@ -23,7 +22,7 @@ from shared.errors import InputError
 def input_hashes(stage: Stage, subject: Subject, run: RunFolder, parameters: Mapping[str, object],
                  memory: HashMemory) -> dict[str, str]:
     """{name: SHA-256} of all that the stage reads; InputError where an input stage has no sound result."""
-    inputs = source_inputs(stage, subject, memory) | file_inputs(stage, parameters, memory)
+    inputs = own_inputs(stage, subject, parameters, memory)
     for name, folder in run.inputs(stage, [clip.name for clip in subject.clips]).items():
         manifest = read_manifest(folder)
         faults = ["has no result yet"] if manifest is None else damage(folder, manifest, memory)

@@ -134,9 +134,9 @@ class Stage:
     """Declaration of one stage. `seed` is added to the parameters of each.
 
     inputs: stages whose folders are read. A stage without inputs reads the subject's video. given: files of the subject
-    that are read where subject.yaml names them. A stage named export_* publishes to `export/`, all others to
-    `work/<name>/`. joins: inputs of which the stage reads every clip's, where a subject has several clips; a stage
-    that joins nothing then runs for each clip by itself.
+    that are read where subject.yaml names them. models: files of the models folder that are read, see models.py. A
+    stage named export_* publishes to `export/`, all others to `work/<name>/`. joins: inputs of which the stage reads
+    every clip's, where a subject has several clips; a stage that joins nothing then runs for each clip by itself.
     """
 
     name: str
@@ -147,6 +147,7 @@ class Stage:
     parameters: tuple[Parameter, ...] = ()
     given: tuple[str, ...] = ()
     joins: tuple[str, ...] = ()
+    models: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "inputs", tuple(self.inputs))

@@ -14,8 +14,7 @@ from shared.contract.currency import input_hashes, work_to_do
 from shared.contract.disk import check_space, disk_fault
 from shared.contract.hashing import HashMemory
 from shared.contract.job import Job
-from shared.contract.manifest import LOG, MANIFEST, PROVENANCE, Work, output_entries, write_record
-from shared.contract.pipeline import REPOSITORY
+from shared.contract.manifest import LOG, MANIFEST, PROVENANCE, Work, output_entries, volatile_entries, write_record
 from shared.contract.progress import Reporter
 from shared.contract.provenance import Meter, environment
 from shared.contract.source import loaded_code
@@ -87,16 +86,16 @@ def _do(request: Request, work: Work, run: Callable[[Job], None], check: Callabl
     entries = output_entries(stage, temporary)
     write_record(temporary / MANIFEST, {**work.content(), "key": work.key, "outputs": entries})
     size = sum(path.stat().st_size for path in temporary.rglob("*") if path.is_file())
-    provenance = {**cost, **environment(), "code": loaded_code(REPOSITORY), "threads": request.threads,
-                  "warnings": reporter.warnings, "bytes": size}
+    volatile = volatile_entries(temporary, entries)
+    provenance = {**cost, **environment(), "code": loaded_code(request.roots), "threads": request.threads,
+                  "warnings": reporter.warnings, "bytes": size, "volatile": volatile}
     write_record(temporary / PROVENANCE, provenance)
     reporter.write_log(f"done in {cost['wall_s']} s, peak memory {cost['peak_memory_mb']} MB")
     reporter.close()
     folders.publish(temporary, stage.name)
     published = folders.published(stage.name)
-    for name, entry in entries.items():
-        if "sha256" in entry:
-            memory.learn(published / name, entry["sha256"])
+    for name, entry in {**entries, **volatile}.items():
+        memory.learn(published / name, entry["sha256"])
     memory.save()
     folders.write_stamp(stage.name)
     return cost["wall_s"]

@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 from shared.contract.chart_place import AUTO
 from shared.contract.declare import Stage
 from shared.contract.hashing import HashMemory, hash_file, hash_value
+from shared.contract.models import models_folder
 from shared.contract.shapes import describe
 from shared.contract.subject import Subject
 from shared.errors import InputError, LimnError
@@ -102,6 +103,20 @@ def file_inputs(stage: Stage, parameters: Mapping[str, object], memory: HashMemo
     return {f"file {name}": memory.hash(path) for name, path in named.items()}
 
 
+def model_inputs(stage: Stage, memory: HashMemory) -> dict[str, str]:
+    """{model: SHA-256} of the models that the stage reads."""
+    paths = {name: models_folder() / name for name in stage.models}
+    for path in paths.values():
+        if not path.is_file():
+            raise InputError("the models are not set up", where=str(path), got="no such file", mend="run make setup")
+    return {f"model {name}": memory.hash(path) for name, path in paths.items()}
+
+
+def own_inputs(stage: Stage, subject: Subject, parameters: Mapping[str, object], memory: HashMemory) -> dict[str, str]:
+    """{name: SHA-256} of all that the stage reads besides the folders of other stages."""
+    return source_inputs(stage, subject, memory) | file_inputs(stage, parameters, memory) | model_inputs(stage, memory)
+
+
 def outputs_digest(manifest: Mapping[str, object]) -> str:
     """SHA-256 over the names and hashes of all outputs: what later stages depend on."""
     return hash_value({name: entry.get("sha256", "") for name, entry in manifest["outputs"].items()
@@ -170,18 +185,33 @@ def write_record(path: Path, record: Mapping[str, object]) -> None:
     path.write_text(json.dumps(record, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
 
 
+def volatile_entries(folder: Path, outputs: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, object]]:
+    """{file: entry} of the volatile outputs, for provenance.json: so that damage to them is seen, too."""
+    return {name: {"bytes": (folder / name).stat().st_size, "sha256": hash_file(folder / name)}
+            for name, entry in outputs.items() if entry.get("volatile")}
+
+
 def _is_sound(path: Path, entry: Mapping[str, object], memory: HashMemory) -> bool:
     return path.stat().st_size == entry["bytes"] and memory.hash(path) == entry["sha256"]
 
 
 def damage(folder: Path, manifest: Mapping[str, object], memory: HashMemory) -> list[str]:
-    """What is wrong with the published files: missing, or no longer what the manifest says."""
+    """What is wrong with the published files: missing, or no longer what the manifest says, of volatile ones what
+    provenance.json says."""
+    provenance = read_record(folder / PROVENANCE)
+    if provenance is None:
+        return [f"file {PROVENANCE} is missing or damaged"]
+    written = provenance.get("volatile")
     faults = []
     for name, entry in manifest["outputs"].items():
         path = folder / name
+        if entry.get("volatile"):
+            entry = written.get(name) if isinstance(written, dict) else None
         if path.is_symlink() or not path.is_file():
             faults.append(f"file {name} is missing")
-        elif not entry.get("volatile") and not _is_sound(path, entry, memory):
+        elif not isinstance(entry, dict) or not _is_hashed(entry):
+            faults.append(f"file {name} is not on record")
+        elif not _is_sound(path, entry, memory):
             faults.append(f"file {name} is damaged")
     if len(faults) > 2:
         faults[2:] = [f"{len(faults) - 2} more files missing or damaged"]

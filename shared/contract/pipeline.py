@@ -82,6 +82,11 @@ class Pipeline:
                              mend=f"if you know them: --trust {self.path.parent}")
         return self.path.parent
 
+    @property
+    def code_roots(self) -> tuple[Path, ...]:
+        """Where code of the stages may lie: in the repository, and beside pipeline.yaml."""
+        return tuple(dict.fromkeys((REPOSITORY, self.path.parent)))
+
     @cached_property
     def stages(self) -> dict[str, Stage]:
         """The declarations, checked against the steps."""

@@ -10,11 +10,16 @@ import ast
 import hashlib
 import marshal
 import sys
+import sysconfig
+from collections.abc import Sequence
 from pathlib import Path
 from types import CodeType
 
 from shared.contract.declare import Stage
 from shared.errors import InputError, LimnError
+
+_STANDARD_LIBRARY = sysconfig.get_path("stdlib")
+_INSTALLED = {"site-packages", "dist-packages"}
 
 
 def read_declaration(path: Path) -> Stage:
@@ -39,18 +44,25 @@ def read_declaration(path: Path) -> Stage:
     return stage
 
 
-def loaded_code(folder: Path) -> dict[str, str]:
-    """{file relative to folder: fingerprint} of the modules loaded from there, this package excepted."""
+def loaded_code(roots: Sequence[Path]) -> dict[str, str]:
+    """{file relative to the first of the folders that holds it: fingerprint} of the modules loaded from there.
+
+    This package and all that is installed are left out.
+    """
     files = {Path(module.__file__) for module in list(sys.modules.values()) if getattr(module, "__file__", None)}
-    inside = sorted(path for path in files if path.is_relative_to(folder) and path.suffix == ".py")
-    names = [path.relative_to(folder).as_posix() for path in inside]
-    return {name: fingerprint(folder / name) for name in names if not name.startswith((".", "shared/contract/"))}
+    names: dict[str, Path] = {}
+    for path in sorted(files):
+        root = next((root for root in roots if path.is_relative_to(root)), None)
+        if root is not None and path.suffix == ".py" and not path.is_relative_to(_STANDARD_LIBRARY):
+            names.setdefault(path.relative_to(root).as_posix(), path)
+    return {name: fingerprint(path) for name, path in names.items()
+            if not name.startswith((".", "shared/contract/")) and _INSTALLED.isdisjoint(path.parts)}
 
 
 def fingerprint(path: Path) -> str:
     """SHA-256 of the file's byte code: without comments, layout, docstrings and assertions.
 
-    Advisory: a stage runs again when its version changes, not when this does; planning points out the difference.
+    Advisory: a stage runs again when its version changes, not when this does; see drift.py.
     """
     code = compile(path.read_bytes(), "", "exec", dont_inherit=True, optimize=2)
     return hashlib.sha256(marshal.dumps(_without_lines(code), 2)).hexdigest()  # 2: the last without shared references

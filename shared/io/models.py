@@ -1,32 +1,20 @@
 """Where set-up leaves the face networks and the head model, and how a stage reads them.
 
-The folder is the environment variable LIMN_MODELS or `.models` beside the packages. Its `models.json` lists
-each file with SHA-256, source and licence; a file is read only if its hash is the listed one.
+Its `models.json` lists each file with SHA-256, source and licence; a file is read only if its hash is the listed one.
+A stage that reads a model declares it: its hash is in the stage's manifest.
 """
 
 import hashlib
-import os
 from pathlib import Path
 
+from shared.contract.models import HEAD_MODEL_FILE, NETWORK_FILES, models_folder
 from shared.errors import InputError
 from shared.head_model import HeadModel
 from shared.io.arrays import load_arrays, read_json
 from shared.landmarks import FaceNetworks
 
-NETWORK_FILES = {
-    "face_detector": "face_detection_short_range.tflite",
-    "face_landmarks": "face_landmark.tflite",
-    "person_mask": "selfie_segmentation.tflite",
-}
-HEAD_MODEL_FILE = "head_model.npz"
 LIST_FILE = "models.json"
 _MEND = "run make setup"
-
-
-def models_folder() -> Path:
-    """The folder that set-up fills: LIMN_MODELS, or `.models` in the repository."""
-    chosen = os.environ.get("LIMN_MODELS")
-    return Path(chosen) if chosen else Path(__file__).resolve().parents[2] / ".models"
 
 
 def network_path(name: str) -> Path:
