@@ -12,6 +12,8 @@ import time
 from datetime import UTC, datetime
 from importlib import metadata
 
+from shared.contract.machine import kernels, processor
+
 _SAMPLE_S = 0.5
 
 
@@ -73,7 +75,7 @@ def own_peak_bytes() -> int:
 
 
 def environment() -> dict[str, object]:
-    """Host, platform, Python, versions of the loaded packages, command line."""
+    """Host, platform, processor, kernels chosen for it, Python, versions of the loaded packages, command line."""
     loaded = {name.partition(".")[0] for name in sys.modules}
     packages = {}
     for distribution in metadata.distributions():
@@ -85,6 +87,8 @@ def environment() -> dict[str, object]:
         "platform": platform.platform(),
         "python": platform.python_version(),
         "cores": os.cpu_count(),
+        "cpu": processor(),
+        "kernels": kernels(),
         "packages": packages,
         "command": [sys.executable, *sys.argv],
     }
