@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from shared.contract.folders import RunFolder
-from shared.contract.manifest import LOG
+from shared.contract.manifest import LOG, MANIFEST
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
 from tools.cases import Case, InputErrors, Opened
@@ -103,7 +103,7 @@ def clear_leftovers(run: RunFolder, pipeline: Pipeline, keep_logs: bool = True) 
     for name in pipeline.steps:
         with contextlib.suppress(InputError), run.locked(name, _DYING_S):
             for path in run.leftovers(name):
-                if keep_logs and (path / LOG).is_file() and ".tmp-" in path.name:
+                if keep_logs and (path / LOG).is_file() and not (path / MANIFEST).is_file() and ".tmp-" in path.name:
                     run.keep_failed(path, name)
             run.remove_leftovers(name)
 

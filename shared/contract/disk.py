@@ -12,6 +12,7 @@ FULL_BELOW_BYTES = 1 << 20
 _MEND = "free some (limn clean), or write elsewhere with --out DIR"
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _CLOSED = (errno.EROFS, errno.EACCES, errno.EPERM)
+_BROKEN = (errno.EIO, errno.ESTALE)
 
 
 def free_bytes(path: Path) -> int:
@@ -41,4 +42,7 @@ def disk_fault(error: BaseException, path: Path) -> InputError | None:
         return InputError("no space left on the disk", where=str(path), mend=_MEND)
     if numbers.intersection(_CLOSED):
         return InputError("cannot write here", where=str(path), got=str(error), mend="write elsewhere with --out DIR")
+    if numbers.intersection(_BROKEN):
+        return InputError("the disk fails", where=str(path), got=str(error),
+                          mend="check the disk (dmesg), or write elsewhere with --out DIR")
     return None

@@ -110,7 +110,7 @@ def _failed(request: Request, temporary: Path, reporter: Reporter, error: Except
     message = " ".join(str(error).split()) or "no message"
     if not isinstance(error, LimnError):
         message = f"{type(error).__name__}: {message}"
-    last = log.read_text(encoding="utf-8").splitlines()[-_LAST_LINES:]
+    last = log.read_text(encoding="utf-8").splitlines()[-_LAST_LINES:] if log.is_file() else []
     reporter.event("failed", message=message, log=str(log), last=last)
     sys.stderr.write("\n".join([*last, f"{name}: failed: {message}", f"{name}: the whole log: {log}"]) + "\n")
     return 1

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import fcntl
 import os
 import shutil
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -17,6 +19,8 @@ from shared.contract.manifest import LOG, outputs_digest, read_manifest
 from shared.errors import InputError
 
 CLIPS = "clips"
+_HERE, _EXCHANGE = -100, 2
+"""AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""
 
 
 class RunFolder:
@@ -72,15 +76,28 @@ class RunFolder:
         return path
 
     def publish(self, temporary: Path, name: str) -> None:
-        """Renames the finished folder into place; a folder of an earlier run is moved aside first, then removed."""
+        """Renames the finished folder into place, in one step with the folder of an earlier run, which is removed then.
+
+        Where the file system cannot exchange two folders, the earlier one is moved aside first: a process that is
+        killed between the two steps leaves it for remove_leftovers to put back.
+        """
         target = self.published(name)
         old = self.work / f".{name}.old-{os.getpid()}"
         target.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(FileNotFoundError):
+        if not target.exists():
+            temporary.rename(target)
+        elif exchange(temporary, target):
+            with contextlib.suppress(OSError):
+                temporary.rename(old)
+        else:
             target.rename(old)
-        temporary.rename(target)
-        shutil.rmtree(old, ignore_errors=True)
-        shutil.rmtree(self.failed(name), ignore_errors=True)
+            try:
+                temporary.rename(target)
+            except OSError:
+                old.rename(target)
+                raise
+        for path in (old, temporary, self.failed(name)):
+            shutil.rmtree(path, ignore_errors=True)
 
     def inputs(self, stage: Stage, clips: Sequence[str]) -> dict[str, Path]:
         """{name: folder} of a stage's inputs; of those that it joins one of each clip, as clip/name."""
@@ -118,9 +135,13 @@ class RunFolder:
         return [path for kind in ("tmp", "old") for path in self.work.glob(f".{name}.{kind}-*")]
 
     def remove_leftovers(self, name: str) -> None:
-        """Removes what killed processes left of the stage."""
+        """Removes what killed processes left of the stage; a result that was moved aside for a new one comes back."""
         for path in self.leftovers(name):
+            if ".old-" in path.name and not self.published(name).exists() and read_manifest(path) is not None:
+                path.rename(self.published(name))
             shutil.rmtree(path, ignore_errors=True)
+        for path in (*self.work.glob(f".{name}.stamp.*"), *self.work.glob(f"{self.memory.name}.*")):
+            path.unlink(missing_ok=True)
 
     def is_locked(self, name: str) -> bool:
         """Whether another living process holds the lock now."""
@@ -144,6 +165,19 @@ class RunFolder:
             with contextlib.suppress(OSError):
                 for folder in (self.work, self.root, *added):
                     folder.rmdir()
+
+
+def exchange(one: Path, other: Path) -> bool:
+    """Lets two folders change places in one step; False where the system or the file system cannot."""
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if sys.platform == "linux" else None
+    if rename is None:
+        return False
+    if rename(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _EXCHANGE) == 0:
+        return True
+    number = ctypes.get_errno()
+    if number in (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP):
+        return False
+    raise OSError(number, os.strerror(number), str(other))
 
 
 def _is_held(path: Path) -> bool:
