@@ -1,11 +1,13 @@
 """Disturbs runs in every way that happens to operators and compares the outcome with an undisturbed run.
 
-    python tests/fault_matrix.py [--kills 40] [--toy] [--seed 0] [--json FILE] [FAULT ...]
+    python tests/fault_matrix.py [--kills 40] [--writes 60] [--toy] [--seed 0] [--json FILE] [FAULT ...]
 
-FAULT: by_hand, kill, disk_full, read_only, clock, two_runs, half_manifest, flipped_bit (all). Each must leave the
-source as it was and, after at most one more run, exactly the results of the undisturbed run. by_hand runs each stage
-without the workflow. disk_full and read_only mount a tmpfs, clock compiles jumping_clock.c: where that is impossible
-they say so and are left out. Exit code 1 for wrong results.
+FAULT: by_hand, kill, writes, disk_full, read_only, clock, two_runs, half_manifest, flipped_bit (all). Each must leave
+the source as it was and, after at most one more run, exactly the results of the undisturbed run. by_hand runs each
+stage without the workflow. writes disturbs single writes of a stage, drawn from all of them (--writes 0: every one, in
+three ways each, which takes hours): afterwards the earlier result is there or the new one. disk_full and read_only
+mount a tmpfs, clock and writes compile a library to preload: where that is impossible they say so and are left out.
+Exit code 1 for wrong results.
 """
 
 from __future__ import annotations
@@ -23,17 +25,22 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
+from faulty_files import KINDS  # noqa: E402
 from quick import SETTINGS, TINY  # noqa: E402
 from toy_runs import copy_pipeline, make_subject  # noqa: E402
 
 from shared.contract.declare import folder_of  # noqa: E402
+from shared.contract.hashing import HashMemory  # noqa: E402
 from shared.contract.interpreter import settled_environment  # noqa: E402
+from shared.contract.manifest import damage, read_manifest  # noqa: E402
 from shared.contract.pipeline import REPOSITORY, load_pipeline  # noqa: E402
 
 DISK_MB = 600
+FAULTY_FILES = Path(__file__).with_name("faulty_files.c")
 
 
 class Bench:
@@ -95,6 +102,49 @@ class Bench:
                     path = run / folder_of(name) / file
                     found[f"{name}/{file}"] = hashlib.sha256(path.read_bytes()).hexdigest()
         return found
+
+    @cached_property
+    def writes(self) -> list[tuple[str, str, int]]:
+        """(stage, kind of fault, number of the write) for all writes of all stages, in an order drawn by chance.
+
+        Each stage is run with another seed for that: what it makes is kept as its earlier result.
+        """
+        subprocess.run(["cc", "-O1", "-shared", "-fPIC", "-o", self.faulty_files, FAULTY_FILES, "-ldl"], check=True)
+        every = []
+        for stage in self.stages:
+            out, log = self.scratch / "earlier" / stage, self.scratch / f"{stage}.writes"
+            self.prepared(out, stage)
+            done = self.with_faults(stage, out, "--set", "seed=1", FAULTY_LOG=str(log))
+            if done.returncode != 0:
+                raise RuntimeError(f"{stage} with another seed failed:\n{done.stdout}")
+            every += [(stage, kind, at) for at in range(1, len(log.read_text().splitlines()) + 1) for kind in KINDS]
+        self.rng.shuffle(every)
+        return every
+
+    @property
+    def faulty_files(self) -> Path:
+        """The library to preload."""
+        return self.scratch / "faulty_files.so"
+
+    def with_faults(self, stage: str, out: Path, *arguments: str, **faults: str) -> subprocess.CompletedProcess:
+        """One stage by hand, its writes counted and disturbed."""
+        search = os.pathsep.join([str(self.pipeline.root), str(REPOSITORY)])
+        environment = {**os.environ, **settled_environment(1), "PYTHONPATH": search, **faults,
+                       "LD_PRELOAD": str(self.faulty_files), "FAULTY_FOLDER": str(out / "anna")}
+        return subprocess.run([*self.by_hand(stage, out), *arguments], env=environment, stdout=subprocess.PIPE,
+                              stderr=subprocess.STDOUT, text=True, errors="replace", check=False)
+
+    def published(self, run: Path, stage: str) -> dict[str, str] | str | None:
+        """{file: SHA-256} of a stage's result; None where there is none, a text where it is not whole."""
+        folder = run / folder_of(stage)
+        if not folder.exists():
+            return None
+        manifest = read_manifest(folder)
+        faults = damage(folder, manifest, HashMemory(self.scratch / "memory.json", verify=True)) if manifest else [
+            "half published"]
+        vouched = [name for name, entry in manifest["outputs"].items() if not entry.get("volatile")] if manifest else []
+        return "; ".join(faults) or {name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
+                                     for name in (*vouched, "manifest.json")}
 
     def prepared(self, out: Path, until: str) -> Path:
         """out/anna with the results of all stages but this one, so that it has to run."""
@@ -189,6 +239,29 @@ def kill(bench: Bench, out: Path, number: int) -> list[str]:
         time.sleep(0.02)
     faults = [f"process {pid} outlived" for pid in group if alive(pid)] + ["never began"] * (not began)
     return faults + half_published(out / "anna", bench.stages) + bench.judge(out)
+
+
+def writes(bench: Bench, out: Path, number: int) -> list[str]:
+    """A full or failing disk, or a kill, at one write of a stage, every second time over an earlier result."""
+    stage, kind, at = bench.writes[number]
+    run = bench.prepared(out, stage)
+    old = None
+    if number % 2:
+        earlier = bench.scratch / "earlier" / stage / "anna"
+        shutil.copytree(earlier / folder_of(stage), run / folder_of(stage))
+        old = bench.published(earlier, stage)
+    new = bench.published(bench.reference, stage)
+    done = bench.with_faults(stage, out, FAULTY_AT=str(at), FAULTY_AS=kind)
+    found = bench.published(run, stage)
+    allowed = (0, -signal.SIGKILL) if kind == "kill" else (0, 1, 2)
+    faults = [] if found in (old, new) else [f"a third result: {found if isinstance(found, str) else 'other bytes'}"]
+    faults += [f"ended with {done.returncode}: {done.stdout.splitlines()[-3:]}"] * (done.returncode not in allowed)
+    faults += ["called done, is not"] * (done.returncode == 0 and found != new)
+    faults += ["Traceback"] * (done.returncode == 2 and "Traceback" in done.stdout)
+    faults += ["the source changed"] * (contents(bench.subject) != bench.source)
+    if number % 10 == 0:
+        faults += bench.judge(out)
+    return [f"{stage}, {kind} at write {at}: {fault}" for fault in faults]
 
 
 def disk_full(bench: Bench, out: Path, number: int) -> list[str]:
@@ -333,9 +406,9 @@ def can_mount() -> bool:
 
 
 FAULTS: dict[str, tuple[Callable[[Bench, Path, int], list[str]], int, str]] = {
-    "by_hand": (by_hand, 2, ""), "kill": (kill, 40, ""), "disk_full": (disk_full, 5, "mount"),
-    "read_only": (read_only, 2, "mount"), "clock": (clock, 2, "cc"), "two_runs": (two_runs, 3, ""),
-    "half_manifest": (half_manifest, 5, ""), "flipped_bit": (flipped_bit, 5, ""),
+    "by_hand": (by_hand, 2, ""), "kill": (kill, 40, ""), "writes": (writes, 60, "cc"),
+    "disk_full": (disk_full, 5, "mount"), "read_only": (read_only, 2, "mount"), "clock": (clock, 2, "cc"),
+    "two_runs": (two_runs, 3, ""), "half_manifest": (half_manifest, 5, ""), "flipped_bit": (flipped_bit, 5, ""),
 }
 
 
@@ -344,6 +417,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("faults", nargs="*", metavar="FAULT", help=", ".join(FAULTS))
     parser.add_argument("--kills", type=int, default=40)
+    parser.add_argument("--writes", type=int, default=60)
     parser.add_argument("--toy", action="store_true", help="the toy pipeline of the tests: seconds instead of minutes")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, metavar="FILE")
@@ -358,7 +432,8 @@ def main(arguments: list[str] | None = None) -> int:
             if not able[needs]:
                 print(f"{name}: left out, {needs} is not possible here")
                 continue
-            for number in range(options.kills if name == "kill" else count):
+            count = {"kill": options.kills, "writes": options.writes}.get(name, count)
+            for number in range(count or len(bench.writes)):
                 out = Path(tempfile.mkdtemp(dir=folder))
                 start = time.monotonic()
                 wrong = fault(bench, out, number)

@@ -94,11 +94,9 @@ static int fails(int number)
 static const char *absolute(const char *path, char *buffer)
 {
     char folder[PATH_MAX];
-    if (path && path[0] != '/' && getcwd(folder, sizeof folder)) {
-        snprintf(buffer, PATH_MAX, "%s/%.*s", folder, PATH_MAX / 2, path);
-        return buffer;
-    }
-    return path;
+    if (!path || path[0] == '/' || !getcwd(folder, sizeof folder))
+        return path;
+    return snprintf(buffer, PATH_MAX, "%s/%s", folder, path) < PATH_MAX ? buffer : path;
 }
 
 #define OPENER(name, head, arguments, pathname)                                             \
