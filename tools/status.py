@@ -30,7 +30,7 @@ def status_of(case: Case, plans: Mapping[str, StagePlan]) -> dict[str, object]:
             "peak_memory_mb": provenance.get("peak_memory_mb"), "started": provenance.get("started"),
             "folder": str(folder.relative_to(case.run.root)) if folder.is_dir() else None,
             "progress": track.progress if track else "",
-            "running_s": round(time.time() - track.since, 1) if track else None,
+            "running_s": round(max(0.0, time.time() - track.since), 1) if track else None,
             "failed_log": str(failed) if failed.is_file() else "",
         })
     flags = [str(Flag(**flag)) for flag in (read_record(case.run.work / RECORD) or {}).get("flags", ())]
