@@ -175,6 +175,27 @@ def test_models_are_inputs(tmp_path, monkeypatch, capsys):
     assert call() == 2 and capsys.readouterr().err.count("\n") == 1
 
 
+def test_plan_and_run_see_other_models(case, monkeypatch, capsys):
+    pipeline, subject = case
+    edit(pipeline.parent / "toy" / "draw_bars.py", 'inputs=("count_words",),', 'inputs=("count_words",),\n    '
+         'models=("face.tflite",),')
+    folder = subject.parent / "models"
+    folder.mkdir()
+    (folder / "face.tflite").write_text("one network")
+    monkeypatch.setenv("LIMN_MODELS", str(folder))
+    arguments = [str(subject), "--pipeline", str(pipeline)]
+    assert limn("run", *arguments)[0] == 0
+    assert limn_main(["plan", *arguments]) == 0 and "run" not in capsys.readouterr().out.partition("\n")[2]
+    (folder / "face.tflite").write_text("other weights")
+    assert limn_main(["plan", *arguments]) == 0
+    assert "draw_bars    will run  input model face.tflite changed\n" in capsys.readouterr().out
+    (folder / "face.tflite").unlink()
+    assert limn_main(["plan", *arguments]) == 2
+    assert "face.tflite: the models are not set up; got no such file; run make setup" in capsys.readouterr().err
+    code, output = limn("run", *arguments)
+    assert code == 2 and output.count("\n") == 1 and "the models are not set up" in output
+
+
 def test_stages_declare_the_models_that_they_load():
     """Only stages load models, and each names in its declaration all that its loaders read."""
     loaders = {"load_face_networks": set(models.FACE_NETWORKS), "load_head_model": {models.HEAD_MODEL_FILE}}

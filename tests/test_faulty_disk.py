@@ -4,6 +4,7 @@ The same at the real stages' writes, those of the native libraries, too: python 
 """
 
 import contextlib
+import errno
 import hashlib
 import os
 import shutil
@@ -14,6 +15,7 @@ from faulty_files import KINDS, FaultyDisk
 from toy_runs import READ_TEXT, make_subject
 
 from shared.contract import main
+from shared.contract.disk import disk_fault
 from shared.contract.folders import RunFolder
 from shared.contract.hashing import HashMemory
 from shared.contract.manifest import damage, read_manifest
@@ -76,6 +78,15 @@ class Bench:
         shutil.rmtree(self.subject / "work", ignore_errors=True)
         if backup.exists():
             shutil.copytree(backup, self.subject / "work")
+
+
+@pytest.mark.parametrize("number, hint", [(errno.ENOSPC, "no space left"), (errno.EDQUOT, "no space left"),
+                                          (errno.EIO, "the disk fails"), (errno.ESTALE, "the disk fails")])
+def test_reasons_that_libraries_give_in_words_are_understood(tmp_path, number, hint):
+    said = RuntimeError(f"Failed to write pixel data to image file x.exr. {os.strerror(number)}.")
+    for error in (OSError(number, os.strerror(number)), said):
+        assert hint in str(disk_fault(error, tmp_path))
+    assert disk_fault(ValueError("shapes differ"), tmp_path) is None
 
 
 @pytest.mark.parametrize("before", ["nothing", "earlier result", "earlier result, no exchange"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import shutil
 from pathlib import Path
 
@@ -31,13 +32,14 @@ def check_space(path: Path, needed_mb: float | None) -> None:
 def disk_fault(error: BaseException, path: Path) -> InputError | None:
     """The fault as the operator's, where a stage failed because it could not write; None for all other failures.
 
-    Libraries hide the reason, so an almost full disk counts as the reason of any failure.
+    Libraries hide the reason: some name it in words only, and an almost full disk counts as the reason of any failure.
     """
     causes, cause = [], error
     while cause is not None and cause not in causes:
         causes.append(cause)
         cause = cause.__cause__ or cause.__context__
     numbers = {cause.errno for cause in causes if isinstance(cause, OSError)}
+    numbers |= {number for number in (*_FULL, *_BROKEN) if any(os.strerror(number) in str(cause) for cause in causes)}
     if numbers.intersection(_FULL) or free_bytes(path) < FULL_BELOW_BYTES:
         return InputError("no space left on the disk", where=str(path), mend=_MEND)
     if numbers.intersection(_CLOSED):
