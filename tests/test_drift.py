@@ -175,6 +175,28 @@ def test_models_are_inputs(tmp_path, monkeypatch, capsys):
     assert call() == 2 and capsys.readouterr().err.count("\n") == 1
 
 
+def test_a_stage_by_hand_says_what_it_keeps_and_renews_it(tmp_path, capsys):
+    subject, pipeline, runs = make_subject(tmp_path / "anna"), tmp_path / "pipeline.yaml", []
+    pipeline.write_text("stages:\n  read_text: {}\n")
+
+    def call(*arguments):
+        def run(job):
+            runs.append(job)
+            (job.out / "text.txt").write_text("text")
+
+        code = main(READ_TEXT, run, None, ["--subject", str(subject), "--pipeline", str(pipeline), *arguments])
+        return code, capsys.readouterr().err
+
+    assert call()[0] == 0
+    assert call("--renew")[0] == 0 and len(runs) == 1
+    pretend_old_package(subject / "work" / "read_text")
+    code, said = call()
+    assert code == 0 and len(runs) == 1
+    assert f"read_text: kept although packages have changed: numpy {OLD_NUMPY} -> " in said and "anew: --renew" in said
+    assert call("--renew")[0] == 0 and len(runs) == 2
+    assert "kept" not in call()[1] and len(runs) == 2
+
+
 def test_plan_and_run_see_other_models(case, monkeypatch, capsys):
     pipeline, subject = case
     edit(pipeline.parent / "toy" / "draw_bars.py", 'inputs=("count_words",),', 'inputs=("count_words",),\n    '
