@@ -60,7 +60,7 @@ def limn(*arguments, **environment):
 
 def outputs_of(folder):
     """{file: bytes} of a run's published results, without the records of when and how long."""
-    timed = ("provenance.json", "log.txt", "report.html", "when.json")
+    timed = ("provenance.json", "log.txt", "report.html", "when.json", "SHA256SUMS")
     found = {}
     for published in (*(folder / "work" / name for name in CURRENT_STAGES), folder / "export"):
         for path in published.rglob("*"):

@@ -6,6 +6,7 @@
     limn status SUBJECT...   what lies where, sizes, times
     limn report SUBJECT...   where the report is
     limn clean SUBJECT...    remove intermediate results, keep export/
+    limn check EXPORT...     whether results are as they were published
     limn parameters          every stage's parameters
 
 Exit code 0: all well. 1: a stage failed. 2: the input is at fault; then each line on stderr is one fault. 3: finished,
@@ -29,6 +30,7 @@ from shared.contract.subject import MOVES, TRANSFERS
 from shared.contract.wording import unknown_name
 from shared.errors import InputError, LimnError
 from tools.cases import InputErrors, all_parameters, find_subjects, open_cases
+from tools.check_export import check_exports
 from tools.housekeeping import clean, report_path
 from tools.plan import plan_case, plan_lines
 
@@ -89,6 +91,11 @@ def make_parser() -> argparse.ArgumentParser:
     report.add_argument("--open", action="store_true", help="open it in the browser")
     removal.add_argument("--dry-run", action="store_true", help="only say what would go")
     _add_new(commands)
+    check = commands.add_parser("check", help="whether results are as they were published",
+                                description="compares every file with the SHA256SUMS of its export folder")
+    check.add_argument("folders", nargs="+", type=Path, metavar="EXPORT",
+                       help="an export folder, wherever it lies, or a folder that holds one or several")
+    check.set_defaults(command=check_command)
     table = commands.add_parser("parameters", help="every stage's parameters as a table")
     table.add_argument("stages", nargs="*", metavar="STAGE")
     table.add_argument("--pipeline", type=Path, metavar="FILE")
@@ -202,6 +209,13 @@ def new_command(args: argparse.Namespace) -> int:
     print(f"{folder}: {facts}")
     vouch = f" --trust {os.path.realpath(args.clip.parent)}" if args.link else ""
     print(f"look through {folder / 'subject.yaml'}, then: limn run {folder}{vouch}")
+    return 0
+
+
+def check_command(args: argparse.Namespace) -> int:
+    """limn check"""
+    for line in check_exports(args.folders):
+        print(line, flush=True)
     return 0
 
 

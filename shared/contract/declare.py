@@ -121,9 +121,12 @@ class Output:
         return len(parts) == len(pattern) and all(map(fnmatchcase, parts, pattern))
 
 
+EXPORT = "export"
+
+
 def folder_of(name: str) -> str:
     """Where the stage of this name publishes, relative to the run's folder."""
-    return "export" if name.startswith("export_") else f"work/{name}"
+    return EXPORT if name.startswith("export_") else f"work/{name}"
 
 
 SEED = Parameter("seed", int, 0, "Seed of every random choice in the stage.", "", 0, 2**31 - 1)

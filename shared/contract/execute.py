@@ -11,6 +11,7 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from shared.contract.currency import input_hashes, work_to_do
+from shared.contract.declare import EXPORT
 from shared.contract.disk import check_space, disk_fault
 from shared.contract.hashing import HashMemory
 from shared.contract.job import Job
@@ -18,6 +19,7 @@ from shared.contract.manifest import LOG, MANIFEST, PROVENANCE, Work, output_ent
 from shared.contract.progress import Reporter
 from shared.contract.provenance import Meter, environment
 from shared.contract.source import loaded_code
+from shared.contract.sums import write_sums
 from shared.errors import InputError, LimnError
 
 if TYPE_CHECKING:
@@ -92,6 +94,8 @@ def _do(request: Request, work: Work, run: Callable[[Job], None], check: Callabl
     write_record(temporary / PROVENANCE, provenance)
     reporter.write_log(f"done in {cost['wall_s']} s, peak memory {cost['peak_memory_mb']} MB")
     reporter.close()
+    if stage.folder == EXPORT:
+        write_sums(temporary)
     folders.publish(temporary, stage.name)
     published = folders.published(stage.name)
     for name, entry in {**entries, **volatile}.items():
