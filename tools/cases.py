@@ -38,11 +38,12 @@ class Case:
 
     def jobs(self, pipeline: Pipeline) -> list[tuple[Case, str]]:
         """What there is to do, in order: the case and the stage, where a case of several clips stands for the stages
-        that work on all of them, and each clip is a case of its own for the others."""
+        that work on all of them, and each clip is a case of its own for the others. Only what the pipeline wants."""
         clips = [Case(clip, self.run.of_clip(clip.name), clip.name) for clip in self.subject.clips]
         joint = pipeline.joint if clips else pipeline.steps
-        return [(case, name) for case in clips for name in pipeline.steps if name not in joint] + [
-            (self, name) for name in pipeline.steps if name in joint]
+        steps = [name for name in pipeline.steps if name in pipeline.wanted]
+        return [(case, name) for case in clips for name in steps if name not in joint] + [
+            (self, name) for name in steps if name in joint]
 
     def inputs(self, stage: Stage) -> dict[str, Path]:
         """{name: folder} of what a stage of this case reads; of each clip as clip/name where it joins them."""

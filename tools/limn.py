@@ -25,7 +25,7 @@ from pathlib import Path
 
 from shared.contract.confine import trust
 from shared.contract.declare import parameter_table
-from shared.contract.pipeline import load_pipeline, split_settings
+from shared.contract.pipeline import Pipeline, load_pipeline, split_settings
 from shared.contract.subject import MOVES, TRANSFERS
 from shared.contract.wording import unknown_name
 from shared.errors import InputError, LimnError
@@ -79,6 +79,7 @@ def make_parser() -> argparse.ArgumentParser:
     for command in (run, plan):
         command.add_argument("--renew", action="store_true",
                              help="do again what was made by other code or packages than those of today")
+        command.add_argument("--until", metavar="STAGE", help="stop after this stage")
     for command in (plan, status):
         command.add_argument("--verify", action="store_true", help="read every published file again")
     run.add_argument("--cores", type=int, metavar="N", help="cores to use (all)")
@@ -137,7 +138,7 @@ def run_command(args: argparse.Namespace) -> int:
     from tools.gates import check_gates
     from tools.workflow import default_summary, run_cases
 
-    pipeline = load_pipeline(args.pipeline)
+    pipeline = _pipeline_of(args)
     parameters = all_parameters(pipeline, args.preset, args.set)
     check_gates(pipeline)
     opened = open_cases(find_subjects(args.subjects, args.list), args.out)
@@ -229,9 +230,15 @@ def parameters_command(args: argparse.Namespace) -> int:
     return 0
 
 
+def _pipeline_of(args: argparse.Namespace) -> Pipeline:
+    """The pipeline, up to the stage of --until where that is given."""
+    pipeline = load_pipeline(args.pipeline)
+    return pipeline.until(args.until) if getattr(args, "until", None) else pipeline
+
+
 def _for_each_plan(args: argparse.Namespace, show) -> int:
     """Shows each subject; those at fault are named in the end."""
-    pipeline = load_pipeline(args.pipeline)
+    pipeline = _pipeline_of(args)
     parameters = all_parameters(pipeline, args.preset, args.set)
     opened = open_cases(find_subjects(args.subjects, args.list), args.out)
     for case in opened.cases:

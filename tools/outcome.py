@@ -64,7 +64,7 @@ def outcome_of(case: Case, pipeline: Pipeline, plans: Mapping[str, StagePlan], t
              "kept": tuple(kept_lines(plans))}
     left = [name for name, plan in plans.items() if plan.state != CURRENT]
     if not left:
-        flags = tuple(judge(case.run, pipeline))
+        flags = tuple(judge(case.run, pipeline)) if pipeline.wanted == set(pipeline.steps) else ()
         picture = str(case.run.work / PICTURE) if flags else ""
         return Outcome(state="review" if flags else "done", stage=list(plans)[-1], flags=flags, picture=picture,
                        reason="; ".join(map(str, flags)), **facts)

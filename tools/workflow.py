@@ -153,7 +153,7 @@ def _conclude(case: Case, tracks: Sequence[Track], settings: Settings, log: Path
     outcome = outcome_of(case, settings.pipeline, plans, tracks, interrupted, kept)
     left = [name for name, plan in plans.items() if plan.state != CURRENT]
     if not left:
-        _say(f"{case.name}: done in {seconds:.1f} s: {_result(case)}")
+        _say(f"{case.name}: done in {seconds:.1f} s: {_result(case, plans)}")
     elif outcome.state == "interrupted":
         _say(f"{case.name}: interrupted; limn run again goes on with {left[0]}")
     elif outcome.state in ("failed", "input error"):
@@ -177,11 +177,14 @@ def _say_kept(case: Case, plans: Mapping[str, StagePlan]) -> None:
         _say(f"{case.name}: to have {'it' if len(lines) == 1 else 'them'} anew: limn run --renew")
 
 
-def _result(case: Case) -> Path:
-    """The report where there is one, else the export folder, else the run's folder."""
-    export = case.run.root / "export"
-    report = export / "report.html"
-    return report if report.is_file() else export if export.is_dir() else case.run.root
+def _result(case: Case, plans: Mapping[str, StagePlan]) -> Path:
+    """The last stage's report where there is one, else its folder; the run's folder where clips have one each."""
+    last = list(plans.values())[-1]
+    if last.case.clip:
+        return case.run.root
+    folder = last.case.run.published(last.name)
+    report = folder / "report.html"
+    return report if report.is_file() else folder
 
 
 def _say(text: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -56,7 +56,9 @@ class Gate:
 
 @dataclass(frozen=True)
 class Pipeline:
-    """The content of pipeline.yaml. steps are in an order in which each follows what it needs."""
+    """The content of pipeline.yaml. steps are in an order in which each follows what it needs. last: the stage to stop
+    after, '' for the whole pipeline.
+    """
 
     path: Path
     package: str
@@ -65,6 +67,24 @@ class Pipeline:
     default_preset: str
     sizes: Mapping[str, str] = field(default_factory=dict)
     gates: Mapping[str, Gate] = field(default_factory=dict)
+    last: str = ""
+
+    def until(self, stage: str) -> Pipeline:
+        """The same pipeline, of which only this stage and what it needs is wanted; InputError for an unknown one."""
+        if stage not in self.steps:
+            raise unknown_name("stage", stage, self.steps, "--until")
+        return replace(self, last=stage)
+
+    @cached_property
+    def wanted(self) -> frozenset[str]:
+        """The stages that are to be done: all, or `last` and what it needs."""
+        found, open_ends = set(), [self.last] if self.last else list(self.steps)
+        while open_ends:
+            name = open_ends.pop()
+            if name not in found:
+                found.add(name)
+                open_ends += self.steps[name].needs
+        return frozenset(found)
 
     @cached_property
     def root(self) -> Path:
