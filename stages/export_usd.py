@@ -5,7 +5,7 @@ Reads    sample_frames: frames.json and the frames (for the plates and the repor
          solve.json. Of all of them manifest.json and provenance.json. Of several clips the first is exported, and the
          light of each.
 Writes   head.usda with its payload, head.usdz, head.glb, mesh.obj, maps/*.exr, envmap.exr, envmaps/*.exr, poses.npz,
-         plates/*.jpg, renders/*.exr, views/*.exr, run.json, report.html.
+         plates/*.jpg, renders/*.exr, views/*.exr, run.json, methods.txt, report.html.
 Method   Units, axes, colour spaces and sources are stated on everything that is written; then the asset is validated
          as a stranger would find it on disk.
 Fails    values that are not finite, a mesh with broken indices or UVs, a map that is not a square power of two,
@@ -47,6 +47,7 @@ STAGE = Stage(
                colour_space="in each file", optional=True),
         Output("run.json", "parameters, model, costs, residuals and warnings of all stages", volatile=True),
         Output("report.html", "the page for people", volatile=True),
+        Output("methods.txt", "what was done, to paste into a paper, with versions and references", volatile=True),
     ),
     parameters=(
         Parameter("map_format", str, "half", "Precision of the EXR files.", choices=("half", "float")),
@@ -232,6 +233,25 @@ def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     }
 
 
+def method_records(job: Job, record: dict, solve: dict):
+    """RunRecords for the methods text: what each stage left, and the versions of what it loaded."""
+    from shared.contract.provenance import environment
+    from shared.io.arrays import read_json
+    from shared.report.methods import ClipRecords, RunRecords
+
+    packages: dict[str, str] = {}
+    for name in job.input_names:
+        clip, _, stage = name.rpartition("/")
+        packages |= job.provenance(stage, clip).get("packages", {})
+    clips = []
+    for clip in job.clips or ("",):
+        frames = read_json(job.input("sample_frames", clip) / "frames.json")
+        tracking = read_json(job.input("track_landmarks", clip) / "tracking.json")
+        read = job.manifest("track_landmarks", clip).get("inputs", {})
+        clips.append(ClipRecords(clip, frames, tracking, frozenset({"landmarks", "poses"} & read.keys())))
+    return RunRecords(record, solve, clips, packages | environment()["packages"])
+
+
 def run(job: Job) -> None:
     """Writes the result's files, then the report about them."""
     from shared.io.arrays import load_arrays, read_json, write_json
@@ -241,6 +261,7 @@ def run(job: Job) -> None:
     from shared.io.meshes import load_mesh
     from shared.processor import use_baseline_opencv
     from shared.report.build import Result, result_report
+    from shared.report.methods import methods_paragraphs, methods_text
 
     use_baseline_opencv()
     start, solved = time.perf_counter(), job.input("inverse_render")
@@ -258,9 +279,12 @@ def run(job: Job) -> None:
     views = render_views(job, writer, mesh, maps, envmap, poses, frames, solve)
     record = run_record(job, mesh, solve, time.perf_counter() - start)
     write_json(job.out / "run.json", record)
+    methods = method_records(job, record, solve)
+    (job.out / "methods.txt").write_text(methods_text(methods), encoding="utf-8")
     folders = {name: job.input(name) for name in STAGE.inputs}
     files = [(output.path, output.help) for output in STAGE.outputs]
-    result = Result(job.subject.name, folders, frames, mesh, poses, maps, envmap, solve, record, files, views, clips)
+    result = Result(job.subject.name, folders, frames, mesh, poses, maps, envmap, solve, record, files, views, clips,
+                    methods_paragraphs(methods))
     page = result_report(result, job.params.report_frames)
     (job.out / "report.html").write_text(page, encoding="utf-8")
 

@@ -103,7 +103,7 @@ def test_every_file_of_the_contract_is_there(exported):
     pictures |= {f"views/novel_{name}.exr" for name in NOVEL_VIEWS}
     pictures |= {f"views/relit_{name}{kind}.exr" for kind in ("", "_light") for name in STUDIO_LIGHTS}
     layers = {"head.usda", "head_payload.usda", "head_geo.usdc", "head_mtl.usda", "head.usdz", "head.glb"}
-    single = {"mesh.obj", "envmap.exr", "poses.npz", "run.json", "report.html"}
+    single = {"mesh.obj", "envmap.exr", "poses.npz", "run.json", "report.html", "methods.txt"}
     assert files == maps | pictures | layers | single
     assert all(export_usd.STAGE.output_of(file) for file in files)
 

@@ -40,7 +40,7 @@ class Result:
     """What the export holds in memory while it writes: the report's raw material.
 
     folders {stage: folder} of the stages before it; record: the content of run.json; files: (name, text) pairs; views:
-    None when they were not wished; clips: all but the first, where there are several.
+    None when they were not wished; clips: all but the first, where there are several; methods: paragraphs, references.
     """
 
     name: str
@@ -55,6 +55,7 @@ class Result:
     files: Sequence[tuple[str, str]]
     views: ViewSet | None = None
     clips: Sequence[ClipResult] = ()
+    methods: tuple[Sequence[str], Sequence[str]] = ((), ())
 
 
 def result_report(result: Result, frame_count: int) -> str:
@@ -93,6 +94,7 @@ def result_report(result: Result, frame_count: int) -> str:
         parameters=_parameters(record),
         files=result.files,
         clips=[_clip(clip) for clip in result.clips],
+        methods=result.methods,
     )
     return report_html(content)
 

@@ -58,7 +58,7 @@ class ReportContent:
     angles_deg [F, 3] yaw, pitch, roll and position_mm [F, 3] at frame_index [F]. excluded: (frame, stage, reason).
     views: None when they were not wished. ladder: the models tried, one dictionary each, in order. residuals: nested
     dictionaries of numbers. iterations: one dictionary of numbers each. warnings: (stage, text). parameters: (stage,
-    name, value). clips: all but the first, where there are several.
+    name, value). clips: all but the first, where there are several. methods: paragraphs and references.
     """
 
     name: str
@@ -85,3 +85,4 @@ class ReportContent:
     parameters: Sequence[tuple[str, str, object]] = ()
     files: Sequence[tuple[str, str]] = ()
     clips: Sequence[ClipContent] = ()
+    methods: tuple[Sequence[str], Sequence[str]] = ((), ())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from html import escape
 from itertools import groupby
 
 import numpy as np
@@ -101,3 +102,11 @@ def _curves(iterations: Sequence[Mapping[str, float]]) -> dict[str, list[float]]
         name.replace("_", " "): [missing if step.get(name) is None else float(step[name]) for step in iterations]
         for name in names
     }
+
+
+def methods_section(methods: tuple[Sequence[str], Sequence[str]]) -> str:
+    """What was done, in sentences for a paper; references as a numbered list."""
+    paragraphs, references = methods
+    text = "".join(f"<p>{escape(paragraph)}</p>" for paragraph in paragraphs)
+    listed = "".join(f"<li>{escape(reference)}</li>" for reference in references)
+    return f'<p class="note">The same as plain text: methods.txt.</p>{text}<ol>{listed}</ol>'

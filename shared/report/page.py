@@ -50,6 +50,7 @@ def report_html(content: ReportContent) -> str:
         ("ladder", "Models tried", model_sections.ladder_section(content)),
         ("cost", "Time and memory", sections.cost_section(content)),
         ("parameters", "Parameters", sections.parameter_section(content)),
+        ("methods", "Methods", model_sections.methods_section(content.methods)),
         ("files", "Files", sections.table(("file", "what"), content.files)),
     )
     page = Template(_text("page.html"))
