@@ -17,6 +17,7 @@ import numpy as np
 
 from shared.contract import Job, Output, Parameter, Stage, main
 from shared.contract.models import FACE_NETWORKS
+from shared.contract.subject import Subject
 from shared.errors import InputError, LimnError
 
 STAGE = Stage(
@@ -61,7 +62,7 @@ def run(job: Job) -> None:
     subject, params = job.subject, job.params
     reader, networks = open_video(subject.video), load_face_networks()
     info = reader.info
-    chart = watch_for_chart(reader, job)
+    chart = watch_for_chart(reader, job.subject)
     candidates = params.frame_count * params.candidates
     survey = survey_clip(reader, networks, subject.transfer, candidates, job.progress)
     selection = select_frames(survey, info, str(subject.video), frame_count=params.frame_count,
@@ -101,14 +102,14 @@ def transfer_warnings(tag: str, transfer: str) -> list[str]:
     return []
 
 
-def watch_for_chart(reader, job: Job):
+def watch_for_chart(reader, subject: Subject):
     """A ChartWatch for the second pass; a frame that the subject points at is looked at now."""
     from shared.chart_watch import ChartWatch
 
-    place = job.subject.chart
-    chart = ChartWatch(place, job.subject.transfer)
+    place = subject.chart
+    chart = ChartWatch(place, subject.transfer)
     if place.frame is not None:
-        where, size = f"{job.subject.folder / 'subject.yaml'}: chart", (reader.info.width, reader.info.height)
+        where, size = f"{subject.folder / 'subject.yaml'}: chart", (reader.info.width, reader.info.height)
         if any(not 0 <= value <= size[axis] for corner in place.corners for axis, value in enumerate(corner)):
             raise InputError("corners outside the picture", where=where, expected=f"inside {size[0]} x {size[1]} px")
         frame = next(iter(reader.frames([place.frame])), None)

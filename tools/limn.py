@@ -1,6 +1,7 @@
 """limn: from a video of a head turn to a relightable head.
 
     limn new CLIP            make a subject folder from a video
+    limn validate SUBJECT... look at the inputs alone
     limn run SUBJECT...      do what is not done yet
     limn plan SUBJECT...     what run would do, and why
     limn status SUBJECT...   what lies where, sizes, times
@@ -68,6 +69,7 @@ def make_parser() -> argparse.ArgumentParser:
     """The command line of limn."""
     parser = _OneLineParser(prog="limn", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _input_command(commands, "validate", validate_command, "look at the inputs alone, in seconds, and write nothing")
     run = _subject_command(commands, "run", run_command, "do what is not done yet")
     plan = _subject_command(commands, "plan", plan_command, "what run would do, and why")
     status = _subject_command(commands, "status", status_command, "what lies where, sizes, times")
@@ -105,12 +107,17 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _subject_command(commands: argparse._SubParsersAction, name: str, command, text: str) -> argparse.ArgumentParser:
+    parser = _input_command(commands, name, command, text)
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write to DIR/<subject>/, not to the subject's folder")
+    parser.add_argument("--pipeline", type=Path, metavar="FILE", help="another pipeline.yaml")
+    return parser
+
+
+def _input_command(commands: argparse._SubParsersAction, name: str, command, text: str) -> argparse.ArgumentParser:
     parser = commands.add_parser(name, help=text, description=text)
     parser.add_argument("subjects", nargs="*", type=Path, metavar="SUBJECT",
                         help="folder with subject.yaml, or a folder of such")
     parser.add_argument("--list", type=Path, metavar="FILE", help="a file that names one subject a line")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write to DIR/<subject>/, not to the subject's folder")
-    parser.add_argument("--pipeline", type=Path, metavar="FILE", help="another pipeline.yaml")
     parser.add_argument("--trust", type=Path, action="append", default=[], metavar="DIR",
                         help="follow symbolic links into DIR, run stages that lie in it")
     parser.set_defaults(command=command)
@@ -129,6 +136,22 @@ def _add_new(commands: argparse._SubParsersAction) -> None:
     new.add_argument("--transfer", choices=TRANSFERS, default="srgb", help="how the file encodes light (srgb)")
     new.add_argument("--moves", choices=MOVES, default="head", help="what moves (head)")
     new.set_defaults(command=new_command)
+
+
+def validate_command(args: argparse.Namespace) -> int:
+    """limn validate"""
+    from tools.validate import validate
+
+    opened = open_cases(find_subjects(args.subjects, args.list), None)
+    codes = {2 for _ in opened.faults}
+    for _, error in opened.faults:
+        print(f"limn: {error}", file=sys.stderr)
+    for found in validate([case.subject for case in opened.cases]):
+        if found.error or found.crash:
+            codes.add(1 if found.crash else 2)
+            print(f"limn: {found.error or found.crash}", file=sys.stderr)
+        print("".join(f"{line}\n" for line in found.lines()), end="", flush=True)
+    return min(codes, default=0)
 
 
 def run_command(args: argparse.Namespace) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 from shared.clip_survey import ClipSurvey
 from shared.crop_pixels import display_codes
 from shared.errors import InputError
+from shared.face_tracker import FaceTrack
 from shared.frame_quality import spread_evenly
 from shared.framing import Crop, choose_crop, face_height, skull_box
 from shared.io.image_sequence import ImageSequenceReader
@@ -77,11 +78,7 @@ def select_frames(survey: ClipSurvey, info: VideoInfo, where: str, *, frame_coun
     where: the clip, for messages. max_size: px, of the crop. blurred_below: relative sharpness. moves: "head" or
     "camera"; with the former the background should stand still.
     """
-    face = survey.main_face
-    if face is None:
-        raise InputError("no face found in the clip", where=where, got=f"{survey.count} frames looked at",
-                         expected="a face that looks towards the camera, the right way up", mend=MEND_FILM)
-    _check_upright(survey, where)
+    face = upright_face(survey, where)
     reasons, sharpness = survey.verdicts(blurred_below)
     usable = np.array([i for i, reason in enumerate(reasons) if not reason], int)
     if len(usable) < MIN_FRAMES:
@@ -107,12 +104,18 @@ def select_frames(survey: ClipSurvey, info: VideoInfo, where: str, *, frame_coun
     )
 
 
-def _check_upright(survey: ClipSurvey, where: str) -> None:
+def upright_face(survey: ClipSurvey, where: str) -> FaceTrack:
+    """The face that the clip is about; InputError where there is none, or the head lies on its side."""
+    face = survey.main_face
+    if face is None:
+        raise InputError("no face found in the clip", where=where, got=f"{survey.count} frames looked at",
+                         expected="a face that looks towards the camera, the right way up", mend=MEND_FILM)
     turns = survey.quarter_turns()
     if turns:
         transpose = {1: "transpose=2", 2: "hflip,vflip", 3: "transpose=1"}[turns]
         raise InputError("the head is upside down" if turns == 2 else "the head lies on its side", where=where,
                          expected="an upright head", mend=f"ffmpeg -i IN -vf {transpose} -c:v libx264 -crf 12 OUT.mp4")
+    return face
 
 
 def tally(reasons: list[str]) -> str:
@@ -124,9 +127,14 @@ def tally(reasons: list[str]) -> str:
 def _face_warnings(survey: ClipSurvey, landmarks: list[np.ndarray]) -> Iterator[str]:
     if survey.other_faces:
         yield f"{survey.other_faces + 1} faces in the clip: the largest and most lasting one is taken"
-    tall = float(np.median([face_height(points) for points in landmarks]))
-    if tall < SMALL_FACE_PX:
-        yield f"the face is only {tall:.0f} px high: maps will be coarse ({SMALL_FACE_PX} px or more are good)"
+    yield from small_face(float(np.median([face_height(points) for points in landmarks])))
+
+
+def small_face(height_px: float) -> list[str]:
+    """A warning where a face of this height, px of the source frame, shows too little."""
+    if height_px >= SMALL_FACE_PX:
+        return []
+    return [f"the face is only {height_px:.0f} px high: maps will be coarse ({SMALL_FACE_PX} px or more are good)"]
 
 
 def _loss_warnings(reasons: list[str], kept: int) -> Iterator[str]:
