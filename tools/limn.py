@@ -6,6 +6,7 @@
     limn plan SUBJECT...     what run would do, and why
     limn status SUBJECT...   what lies where, sizes, times
     limn report SUBJECT...   where the report is
+    limn overview SUBJECT... one page over all of them
     limn clean SUBJECT...    remove intermediate results, keep export/
     limn check EXPORT...     whether results are as they were published
     limn parameters          every stage's parameters
@@ -74,8 +75,10 @@ def make_parser() -> argparse.ArgumentParser:
     plan = _subject_command(commands, "plan", plan_command, "what run would do, and why")
     status = _subject_command(commands, "status", status_command, "what lies where, sizes, times")
     report = _subject_command(commands, "report", report_command, "where the report is")
+    overview = _subject_command(commands, "overview", overview_command, "one page over all subjects: pictures, gates, "
+                                "warnings, costs")
     removal = _subject_command(commands, "clean", clean_command, "remove intermediate results, keep export/")
-    for command in (run, plan, status, report):
+    for command in (run, plan, status, report, overview):
         command.add_argument("--preset", help="a preset of pipeline.yaml")
         command.add_argument("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help="a parameter")
     for command in (run, plan):
@@ -92,6 +95,8 @@ def make_parser() -> argparse.ArgumentParser:
     run.add_argument("--summary", type=Path, metavar="FILE", help="where to write summary.json")
     status.add_argument("--json", action="store_true", help="print it as JSON")
     report.add_argument("--open", action="store_true", help="open it in the browser")
+    overview.add_argument("--page", type=Path, metavar="FILE", default=Path("overview.html"),
+                          help="where to write it (overview.html)")
     removal.add_argument("--dry-run", action="store_true", help="only say what would go")
     _add_new(commands)
     check = commands.add_parser("check", help="whether results are as they were published",
@@ -212,6 +217,22 @@ def report_command(args: argparse.Namespace) -> int:
             webbrowser.open(path.as_uri())
 
     return _for_each_plan(args, show)
+
+
+def overview_command(args: argparse.Namespace) -> int:
+    """limn overview"""
+    from tools.outcome import at_fault
+    from tools.overview import outcome_now, write_overview
+
+    pipeline = load_pipeline(args.pipeline)
+    parameters = all_parameters(pipeline, args.preset, args.set)
+    opened = open_cases(find_subjects(args.subjects, args.list), args.out)
+    outcomes = [at_fault(folder, error) for folder, error in opened.faults]
+    outcomes += [outcome_now(case, pipeline, plan_case(pipeline, case, parameters)) for case in opened.cases]
+    write_overview(args.page, outcomes, pipeline)
+    print(args.page)
+    opened.all()
+    return 0
 
 
 def clean_command(args: argparse.Namespace) -> int:

@@ -8,12 +8,13 @@ from collections.abc import Sequence
 from tools.outcome import Outcome
 
 _REASON_LETTERS = 110
-_ORDER = ("failed", "killed", "not run", "interrupted", "input error", "review", "done")
+ORDER = ("failed", "killed", "not run", "interrupted", "input error", "review", "done")
+"""States of a subject, the worst first."""
 
 
 def table_lines(outcomes: Sequence[Outcome]) -> list[str]:
     """Subject, stage, state, minutes, memory, quality flags or reason: the worst first, then a sum."""
-    ordered = sorted(outcomes, key=lambda outcome: (_ORDER.index(outcome.state), outcome.subject))
+    ordered = sorted(outcomes, key=lambda outcome: (ORDER.index(outcome.state), outcome.subject))
     rows = [("subject", "stage", "state", "minutes", "memory", "flags, reason")]
     rows += [(o.subject, o.stage or "-", o.state, f"{o.minutes:.1f}", f"{o.memory_mb:.0f} MB", _why(o))
              for o in ordered]
@@ -22,7 +23,7 @@ def table_lines(outcomes: Sequence[Outcome]) -> list[str]:
                           for i, (cell, width) in enumerate(zip(row, widths, strict=False))), row[5]]).rstrip()
              for row in rows]
     counts = Counter(outcome.state for outcome in outcomes)
-    tally = ", ".join(f"{counts[state]} {state}" for state in reversed(_ORDER) if counts[state])
+    tally = ", ".join(f"{counts[state]} {state}" for state in reversed(ORDER) if counts[state])
     return [*lines, f"{len(outcomes)} subjects: {tally}"]
 
 

@@ -23,6 +23,7 @@ from shared.errors import InputError
 from tools.cases import Case, InputErrors, Opened
 from tools.engine import SCRATCH, Settings, configure, run_engine, scratch_folder
 from tools.outcome import Outcome, at_fault, exit_code, outcome_of, write_summary
+from tools.overview import page_beside, write_overview
 from tools.plan import CURRENT, StagePlan, kept_lines, plan_case
 from tools.summary import table_lines
 from tools.watch import Track, Watch
@@ -60,12 +61,17 @@ def run_cases(opened: Opened, settings: Settings) -> int:
 
 
 def _finish(outcomes: Sequence[Outcome], settings: Settings, started: str, seconds: float) -> int:
-    """The table and summary.json; returns the exit code."""
+    """The table, summary.json and the page beside it; returns the exit code."""
     if len(outcomes) > 1 or any(outcome.flags for outcome in outcomes):
         _say("\n".join(table_lines(outcomes)))
     if settings.summary:
-        write_summary(settings.summary, outcomes, started, seconds)
-        _say(f"summary: {settings.summary}")
+        page = page_beside(settings.summary)
+        try:
+            write_overview(page, outcomes, settings.pipeline)
+            _say(f"overview: {page}")
+        finally:
+            write_summary(settings.summary, outcomes, started, seconds)
+            _say(f"summary: {settings.summary}")
     return exit_code(outcomes)
 
 
