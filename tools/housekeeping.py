@@ -11,6 +11,7 @@ from shared.contract.folders import CLIPS, RunFolder
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
 from tools.cases import Case
+from tools.cluster import LOG_SUFFIX
 from tools.gates import PICTURE, RECORD
 from tools.plan import StagePlan
 from tools.workflow import clear_leftovers
@@ -20,7 +21,7 @@ def removable(run: RunFolder, pipeline: Pipeline) -> list[Path]:
     """What clean removes: what the pipeline has written under work/, never export/, never anything else."""
     names = tuple(pipeline.steps)
     paths = [run.work / name for name in names] + [run.failed(name) for name in names]
-    paths += [run.stamp(name) for name in names]
+    paths += [run.stamp(name) for name in names] + [run.work / f"{name}{LOG_SUFFIX}" for name in names]
     paths += [run.memory, *(run.work / name for name in ("workflow.log", RECORD, PICTURE))]
     found = [path for path in paths if path.exists()]
     return found + [path for clip in run.clips() for path in removable(clip, pipeline)]

@@ -21,6 +21,7 @@ from shared.contract.manifest import LOG, MANIFEST
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
 from tools.cases import Case, InputErrors, Opened
+from tools.cluster import keep_slurm_logs
 from tools.engine import SCRATCH, Settings, configure, run_engine, scratch_folder
 from tools.outcome import Outcome, at_fault, exit_code, outcome_of, write_summary
 from tools.overview import page_beside, write_overview
@@ -138,6 +139,8 @@ def _run_waiting(cases: Sequence[Case], settings: Settings, start: float) -> dic
             interrupted = not run_engine(scratches[0], settings, watch, log)
         finally:
             watch.close()
+            if settings.profile:
+                keep_slurm_logs(scratches[0])
         for case in cases:
             clear_all_leftovers(case, settings.pipeline, keep_logs=not interrupted)
         if not interrupted and all(track.state == "waiting" for track in watch.tracks):
