@@ -8,6 +8,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+INSTALL := $(BIN)/python -m pip install --quiet --require-hashes --no-deps --no-build-isolation
 CASES ?= quick
 OUT ?= build/chart
 
@@ -17,10 +18,15 @@ setup: $(STAMP)
 	$(BIN)/python -m tools.check_host
 	$(BIN)/python -m tools.setup_models
 
-$(STAMP): requirements.lock pyproject.toml
+# Every file is compared with its hash. The line after torch's adds nothing to the CPU build; the package index's build for
+# Linux names libraries of CUDA, which are pinned by torch's own metadata, without hashes.
+$(STAMP): requirements-build.lock requirements.lock requirements-torch.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --requirement requirements.lock
-	$(BIN)/pip install --quiet --no-deps --no-build-isolation --editable .
+	$(INSTALL) --requirement requirements-build.lock
+	$(INSTALL) --requirement requirements.lock
+	$(INSTALL) --requirement requirements-torch.lock
+	$(BIN)/python -m pip install --quiet torch
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 
 demo: setup
