@@ -18,14 +18,15 @@ setup: $(STAMP)
 	$(BIN)/python -m tools.check_host
 	$(BIN)/python -m tools.setup_models
 
-# Every file is compared with its hash. The line after torch's adds nothing to the CPU build; the package index's build for
-# Linux names libraries of CUDA, which are pinned by torch's own metadata, without hashes.
-$(STAMP): requirements-build.lock requirements.lock requirements-torch.lock pyproject.toml
+# Every file is compared with its hash, but for CUDA's libraries, which only the package index's torch for Linux wants: it
+# is taken where the CPU build is not to be had.
+$(STAMP): requirements-build.lock requirements.lock requirements-torch-cpu.lock requirements-torch.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) --requirement requirements-build.lock
 	$(INSTALL) --requirement requirements.lock
-	$(INSTALL) --requirement requirements-torch.lock
-	$(BIN)/python -m pip install --quiet torch
+	$(INSTALL) --requirement requirements-torch-cpu.lock || { \
+	  echo "torch: its CPU build is not to be had (see docs/operators.md), so the package index's is taken"; \
+	  $(INSTALL) --requirement requirements-torch.lock && $(BIN)/python -m pip install --quiet torch; }
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 

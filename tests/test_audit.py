@@ -1,12 +1,22 @@
 """Licences, advisories and the bill of materials, from the metadata of what is installed."""
 
 import json
+import re
 import zipfile
+from pathlib import Path
 
 import pytest
 
 from shared.errors import InputError
-from tools.audit import changed_files, is_affected, licence_findings, main, read_advisories, vulnerabilities
+from tools.audit import (
+    bundled_notes,
+    changed_files,
+    is_affected,
+    licence_findings,
+    main,
+    read_advisories,
+    vulnerabilities,
+)
 from tools.packages import Package, installed
 from tools.sbom import bill
 
@@ -61,7 +71,7 @@ def test_only_licences_that_bind_a_run_are_findings():
 def test_installed_packages_have_known_licences(capsys, tmp_path):
     packages = {package.name: package for package in installed()}
     assert packages["numpy"].scope == "run" and packages["pytest"].scope == "dev"
-    assert packages["pymeshlab"].scope == "set-up" and packages["pymeshlab"].is_copyleft
+    assert packages["pymeshlab"].scope == "tests" and packages["pymeshlab"].is_copyleft
     assert licence_findings(packages.values()) == []
     (tmp_path / "TOY-1.json").write_text(json.dumps({"id": "TOY-2", "affected": [
         {"package": {"ecosystem": "PyPI", "name": "numpy"}, **events(("introduced", "0"))}]}))
@@ -79,6 +89,39 @@ def test_bill_of_materials_is_consistent():
     assert edges["pkg:pypi/limn@0.1.0"] == ["pkg:pypi/toy-lib@1.4.2"] and set(edges) <= set(refs)
     licences = {component["name"]: component["licenses"][0] for component in made["components"]}
     assert licences["toy_lib"] == {"expression": "MIT"} and licences["odd"] == {"license": {"name": "unknown"}}
+
+
+def toy_distribution(folder, name, files):
+    """An installed package of these files."""
+    info = folder / f"{name}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    for path, data in files.items():
+        (folder / path).parent.mkdir(exist_ok=True)
+        (folder / path).write_bytes(data)
+    (info / "RECORD").write_text("".join(f"{path},,\n" for path in files))
+
+
+def test_copyleft_in_wheels_is_noted_with_what_loads_it(tmp_path, monkeypatch):
+    toy_distribution(tmp_path, "decoder", {
+        "decoder.libs/libx264-12ab.so.165": b"\x7fELF", "decoder.libs/libz-1.so": b"",
+        "decoder.libs/libavcodec-34cd.so.62": b"..libx264-12ab.so.165.."})
+    toy_distribution(tmp_path, "solver", {"solver/_core.so": b"/build/v7/CHOLMOD/Supernodal/cholmod_super_numeric.c"})
+    toy_distribution(tmp_path, "plain", {"plain/_core.so": b"/build/CHOLMOD/Check/cholmod_check.c"})
+    monkeypatch.setattr("sys.path", [str(tmp_path)])
+    assert bundled_notes() == [
+        "note: decoder 1.0 brings libx264 (GPL-2.0), loaded with libavcodec",
+        "note: solver 1.0 brings CHOLMOD's Supernodal (GPL-2.0-or-later), built in"]
+
+
+def test_the_page_on_licences_says_what_is_installed():
+    text = (Path(__file__).resolve().parents[1] / "docs" / "licences.md").read_text(encoding="utf-8")
+    for package in installed():
+        if package.scope == "run" and not re.match(r"(Apache|BSD|MIT|PSF|ISC|Zlib)", package.licence):
+            assert f"`{package.name}`" in text, package
+    for note in bundled_notes():
+        name, version = note.split()[1:3]
+        assert f"`{name}` {version}" in text, note
 
 
 def test_changed_files_are_noticed(tmp_path, monkeypatch):

@@ -10,7 +10,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-LOCKS = ("requirements-build.lock", "requirements.lock", "requirements-torch.lock", "requirements-cluster.lock")
+TORCH = "requirements-torch-cpu.lock", "requirements-torch.lock"
+LOCKS = ("requirements-build.lock", "requirements.lock", *TORCH, "requirements-cluster.lock")
 OPTIONS = {"--only-binary :all:", "--no-binary connection-pool"}
 HASH = re.compile(r"--hash=sha256:[0-9a-f]{64}")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -42,10 +43,11 @@ def test_every_package_has_hashes_and_no_line_names_a_host(lock):
 
 
 def test_a_package_is_in_one_lock_and_cuda_in_none():
-    names = [name for found in ALL.values() for name in found]
+    names = [name for lock, found in ALL.items() for name in found if lock != TORCH[0]]
     assert len(set(names)) == len(names)
     assert not [name for name in names if re.match(r"nvidia|cuda|triton", name)]
-    assert set(ALL["requirements-torch.lock"]) == {"torch"}
+    (cpu, _), (both, _) = (ALL[lock]["torch"] for lock in TORCH)
+    assert all(set(ALL[lock]) == {"torch"} for lock in TORCH) and cpu == f"{both}+cpu"
 
 
 def test_what_the_project_asks_for_is_locked():
@@ -65,7 +67,7 @@ def test_the_build_is_pinned():
 def test_locks_hold_all_that_their_packages_need():
     """By the metadata of what set-up has installed, in the locked versions. What torch wants of CUDA is apart."""
     locked = {name: version for found in ALL.values() for name, (version, _) in found.items()}
-    own = {name for lock in ("requirements.lock", "requirements-torch.lock") for name in ALL[lock]}
+    own = {name for lock in ("requirements.lock", TORCH[1]) for name in ALL[lock]}
     for name in sorted(own):
         item = metadata.distribution(name)
         assert item.version.partition("+")[0] == locked[name], f"{name}: run make setup"
@@ -82,5 +84,5 @@ def test_set_up_compares_hashes():
     makefile = (ROOT / "Makefile").read_text()
     install = re.search(r"^INSTALL := (.*)$", makefile, re.MULTILINE).group(1)
     assert {"--require-hashes", "--no-deps", "--no-build-isolation"} <= set(install.split())
-    for lock in LOCKS[:3]:
+    for lock in LOCKS[:4]:
         assert f"$(INSTALL) --requirement {lock}" in makefile and lock in makefile.partition("$(STAMP): ")[2]

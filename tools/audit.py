@@ -15,9 +15,10 @@ import argparse
 import base64
 import hashlib
 import json
+import mmap
 import sys
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -32,6 +33,12 @@ COPYLEFT_LIBRARIES = {
     "libx264": "GPL-2.0", "libx265": "GPL-2.0", "libxvidcore": "GPL-2.0", "libpostproc": "GPL-2.0",
     "libreadline": "GPL-3.0", "libgsl": "GPL-3.0", "libCGAL": "GPL-3.0", "libfftw3": "GPL-2.0",
 }
+BUILT_IN = {
+    b"/CHOLMOD/Supernodal/": "CHOLMOD's Supernodal (GPL-2.0-or-later), built in",
+    b"/CHOLMOD/MatrixOps/": "CHOLMOD's MatrixOps (GPL-2.0-or-later), built in",
+    b"/SPQR/Source/": "SPQR (GPL-2.0-or-later), built in",
+}
+"""Paths of sources that a compiler leaves in what it makes."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -76,17 +83,37 @@ def licence_findings(packages: Iterable[Package]) -> list[str]:
 
 
 def bundled_notes() -> list[str]:
-    """Copyleft libraries that wheels bring along, which their metadata does not say.
+    """Copyleft libraries that wheels bring along, as files or built in, which their metadata does not say.
 
-    It matters to whoever passes an installation on; a run neither needs nor links them itself.
+    It matters to whoever passes an installation on; docs/licences.md says what it means.
     """
     notes = []
     for item in metadata.distributions():
-        names = {file.name.partition("-")[0].partition(".")[0] for file in item.files or () if ".so" in file.name}
-        if found := sorted(names & COPYLEFT_LIBRARIES.keys()):
-            licences = ", ".join(f"{name} ({COPYLEFT_LIBRARIES[name]})" for name in found)
-            notes.append(f"note: {item.name} {item.version} bundles {licences}")
+        libraries = [Path(file.locate()) for file in item.files or () if ".so" in file.name]
+        found = [note for path in libraries if (note := _as_file(path, libraries))]
+        found += sorted({BUILT_IN[mark] for path in libraries for mark in marks_in(path, BUILT_IN)})
+        if found:
+            notes.append(f"note: {item.name} {item.version} brings {'; '.join(found)}")
     return sorted(notes)
+
+
+def _as_file(path: Path, siblings: Sequence[Path]) -> str:
+    """What a library's name says of its licence, and which libraries beside it load it; '' where it says nothing."""
+    name = path.name.partition("-")[0].partition(".")[0]
+    if name not in COPYLEFT_LIBRARIES:
+        return ""
+    users = sorted(other.name.partition("-")[0] for other in siblings
+                   if other != path and marks_in(other, [path.name.encode()]))
+    return f"{name} ({COPYLEFT_LIBRARIES[name]})" + (f", loaded with {', '.join(users)}" if users else "")
+
+
+def marks_in(path: Path, marks: Iterable[bytes]) -> list[bytes]:
+    """Those byte strings that a file holds; none where it cannot be read."""
+    try:
+        with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            return [mark for mark in marks if data.find(mark) >= 0]
+    except (OSError, ValueError):  # gone, or empty
+        return []
 
 
 def changed_files() -> list[str]:

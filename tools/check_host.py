@@ -2,9 +2,9 @@
 
     python -m tools.check_host
 
-pymeshlab does not import without libGL, libX11 and libxcb, and without libOpenGL it imports but silently lacks its
-meshing filters. What is missing is installed through apt where that is possible (root and apt-get); else the one
-command to run is printed and the exit code is 2.
+pymeshlab, which tests use, does not import without libGL, libX11 and libxcb, and without libOpenGL it imports but
+silently lacks its meshing filters. What is missing is installed through apt where that is possible (root and apt-get);
+else the one command to run is printed and the exit code is 2.
 """
 
 import ctypes

@@ -25,7 +25,7 @@ _COPYLEFT = re.compile(r"(?<!L)(?<!Lesser )\bA?GPL", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Package:
-    """An installed distribution. scope: run (what a run imports or starts), set-up, development or cluster."""
+    """An installed distribution. scope: run (what a run imports or starts), tests, dev or cluster."""
 
     name: str
     version: str
@@ -40,8 +40,8 @@ class Package:
         return all(_COPYLEFT.search(choice) for choice in choices)
 
 
-SETUP_ONLY = frozenset({"pymeshlab"})
-"""Needed to build the head model and by tests; no stage imports it."""
+TESTS_ONLY = frozenset({"pymeshlab"})
+"""An independent judge of meshes for tests; nothing else imports it."""
 EXTRAS = ("dev", "cluster")
 
 
@@ -49,11 +49,11 @@ def installed() -> list[Package]:
     """All packages, by name."""
     found = {canonicalize_name(item.name): item for item in metadata.distributions() if item.name}
     needs = {name: _needs(item, found) for name, item in found.items()}
-    runs = _reached([name for name in needs.get(ROOT, ()) if name not in SETUP_ONLY], needs) | {ROOT}
+    runs = _reached([name for name in needs.get(ROOT, ()) if name not in TESTS_ONLY], needs) | {ROOT}
     extra = {group: _reached(_needs_of_extra(group, found), needs) for group in EXTRAS}
     packages = []
     for name, item in sorted(found.items()):
-        scope = "run" if name in runs else "set-up" if name in SETUP_ONLY else next(
+        scope = "run" if name in runs else "tests" if name in TESTS_ONLY else next(
             (group for group in EXTRAS if name in extra[group]), "other")
         packages.append(Package(item.name, item.version, licence_of(item), tuple(sorted(needs[name])), scope))
     return packages
