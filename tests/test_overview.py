@@ -112,6 +112,16 @@ def test_a_damaged_picture_is_said_and_the_page_is_written(result, tmp_path):
     assert "a picture that cannot be read" in overview_page(one, load_pipeline(), tmp_path)
 
 
+@pytest.mark.parametrize("place", ["export/plates", "export/views/novel_left.exr", "work/sample_frames"])
+def test_no_picture_comes_from_elsewhere(result, tmp_path, place):
+    copy = shutil.copytree(result, tmp_path / "anna")
+    shutil.move(copy / place, tmp_path / "victim")
+    (copy / place).symlink_to(tmp_path / "victim")
+    state = "failed" if place.startswith("work") else "done"
+    page = overview_page([Outcome("anna", "in", state, "export_usd", results=str(copy))], load_pipeline(), tmp_path)
+    assert "a link that leads elsewhere" in page and "data:image" not in page.partition("<tbody")[2]
+
+
 @pytest.mark.parametrize("record", [
     "[]", "{", '{"values": [1], "flags": {"a": 1}}', '{"values": {"coverage": "x"}, "flags": [3, {"gate": 1}]}',
     '{"values": {"coverage": null}, "flags": [{"gate": "coverage", "value": "much", "limit": "1"}]}',

@@ -1,15 +1,15 @@
 """limn: from a video of a head turn to a relightable head.
 
-    limn new CLIP            make a subject folder from a video
-    limn validate SUBJECT... look at the inputs alone
-    limn run SUBJECT...      do what is not done yet
-    limn plan SUBJECT...     what run would do, and why
-    limn status SUBJECT...   what lies where, sizes, times
-    limn report SUBJECT...   where the report is
-    limn overview SUBJECT... one page over all of them
-    limn clean SUBJECT...    remove intermediate results, keep export/
-    limn check EXPORT...     whether results are as they were published
-    limn parameters          every stage's parameters
+    limn new CLIP             make a subject folder from a video
+    limn validate SUBJECT...  look at the inputs alone
+    limn run SUBJECT...       do what is not done yet
+    limn plan SUBJECT...      what run would do, and why
+    limn status SUBJECT...    what lies where, sizes, times
+    limn report SUBJECT...    where the report is
+    limn overview SUBJECT...  one page over all of them
+    limn clean SUBJECT...     remove intermediate results, keep export/
+    limn check EXPORT...      whether results are as they were published
+    limn parameters           every stage's parameters
 
 Exit code 0: all well. 1: a stage failed. 2: the input is at fault; then each line on stderr is one fault. 3: finished,
 but a quality gate of pipeline.yaml is missed: have a look.

@@ -22,8 +22,10 @@ SIDE_VIEW = "left"
 
 def result_pictures(run: RunFolder) -> list[tuple[str, str]]:
     """(what it shows, data URI) of a finished result, of those files that its parameters left; InputError where one
-    cannot be read."""
+    cannot be read, or lies elsewhere."""
     export, found = run.published("export_usd"), []
+    for folder in (export / "plates", export / "renders", export / "views"):
+        _check_own(run, folder)
     frames = _numbers(export / "renders", ".exr")
     shown = frames[len(frames) // 2] if frames else next(iter(_numbers(export / "plates", ".jpg")), None)
     plate = export / "plates" / f"{shown:04d}.jpg" if shown is not None else None
@@ -41,6 +43,7 @@ def result_pictures(run: RunFolder) -> list[tuple[str, str]]:
 def crop_pictures(run: RunFolder) -> list[tuple[str, str]]:
     """The same of a subject that got no further than its first stage, or of the first of its clips."""
     folders = [clip.published("sample_frames") for clip in run.clips()] or [run.published("sample_frames")]
+    _check_own(run, folders[0] / "frames")
     frames = _numbers(folders[0] / "frames", ".png")
     if not frames:
         return []
@@ -48,10 +51,17 @@ def crop_pictures(run: RunFolder) -> list[tuple[str, str]]:
     return [("crop", _uri(_picture(folders[0] / "frames" / "%06d.png", shown)))]
 
 
+def _check_own(run: RunFolder, folder: Path) -> None:
+    """InputError where the folder, or a file in it, is a link that leads out of the subject's results."""
+    root = run.root.resolve()
+    for path in (folder, *folder.glob("*")):
+        if not path.resolve().is_relative_to(root):
+            raise InputError("a link that leads elsewhere", where=str(path))
+
+
 def _numbers(folder: Path, suffix: str) -> list[int]:
     """Numbers of the files that are named by one."""
-    return sorted(int(path.stem) for path in folder.glob(f"*{suffix}")
-                  if path.stem.isascii() and path.stem.isdigit() and not path.is_symlink())
+    return sorted(int(path.stem) for path in folder.glob(f"*{suffix}") if path.stem.isascii() and path.stem.isdigit())
 
 
 def _is_acescg(export: Path) -> bool:
