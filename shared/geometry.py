@@ -71,6 +71,13 @@ def camera_centres(camera_from_head: np.ndarray) -> np.ndarray:
     return invert_rigid(camera_from_head)[..., :3, 3]
 
 
+def rotation_range_deg(camera_from_head: np.ndarray) -> float:
+    """Largest angle between two frames' views of the head, in degrees; poses [F, 4, 4]."""
+    centres = camera_centres(camera_from_head)
+    directions = centres / np.linalg.norm(centres, axis=-1, keepdims=True)
+    return float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0))))
+
+
 def world_from_head(camera_from_head: np.ndarray, moves: str) -> np.ndarray:
     """[F, 4, 4] -> [F, 3, 3]: turns head-space directions into the space in which the light stands still.
 

@@ -6,7 +6,8 @@ Writes   poses.npz, mesh.npz, landmarks.npz, tracks.npz, tracking.json, overlay.
 Method   468 landmarks a frame start the poses, dense flow and then tracks against the clip's mean texture, adjusted as
          one rigid body, hold them still; the head model is fitted to the tracks and then bent to them freely. Scale is
          the head model's prior.
-Fails    no landmarks in three frames; skin that cannot be tracked (too small, blurred, or not the same head).
+Fails    no landmarks in three frames; skin that cannot be tracked (too small, blurred, or not the same head); a head
+         that does not turn (a poster, too).
 """
 
 from __future__ import annotations
@@ -135,7 +136,8 @@ def excluded_frames(frames, used: np.ndarray, presence: np.ndarray, reasons: lis
 
 def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[dict]) -> dict:
     """tracking.json; its warnings also go to the log."""
-    from shared.solve.judge_track import rotation_deviation_deg, rotation_range_deg, warnings_of
+    from shared.geometry import rotation_range_deg
+    from shared.solve.judge_track import rotation_deviation_deg, warnings_of
 
     lips = track.fit.vertices[np.unique(model.faces[model.segment("lips")])]
     warnings = warnings_of(track, fits, frames.count, frames.focal_known, lips)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shared.geometry import rigid, rotation_from_vector
-from shared.solve.judge_track import judge_frames, mouth_ratio, rotation_range_deg, warnings_of
+from shared.geometry import rigid, rotation_from_vector, rotation_range_deg
+from shared.solve.judge_track import judge_frames, mouth_ratio, warnings_of
 from shared.solve.track_head import HeadTrack
 
 FRAMES, POINTS = 20, 60

@@ -114,6 +114,32 @@ def test_bad_gate_is_one_line(pipeline, tmp_path, capsys, text, hint):
     assert error.count("\n") == 1 and hint in error and tree(subject) == ["clip.txt", "subject.yaml"]
 
 
+def test_gates_of_the_tracking_say_a_wrong_lens_and_a_head_that_hardly_turns(tmp_path):
+    from shared.contract.folders import RunFolder
+    from shared.contract.pipeline import load_pipeline
+    from shared.io.arrays import write_json
+    from tools import gates
+
+    run = RunFolder(tmp_path)
+    folder = run.published("track_landmarks")
+    folder.mkdir(parents=True)
+
+    def missed(p95=0.45, turned=54.0, gain=1.02, solved=False):
+        write_json(folder / "tracking.json", {
+            "reprojection_px": {"median": 0.1, "p95": p95}, "rotation_range_deg": turned,
+            "focal": {"gain": gain, "log_deviation": 0.04, "solved": solved}})
+        limits = load_pipeline(None).gates
+        values = {name: gates.MEASURES[name](run) for name in limits}
+        return [name for name, value in values.items() if value is not None and not limits[name].holds(value)]
+
+    assert missed() == [] and missed(gain=1.1) == [] and missed(gain=3.0, solved=True) == []
+    assert missed(p95=1.27) == ["reprojection_p95_px"]
+    assert missed(turned=0.03) == ["rotation_range_deg"]
+    assert missed(gain=3.0) == ["focal_off"] == missed(gain=1 / 3) == missed(gain=1.5)
+    write_json(folder / "tracking.json", {"reprojection_px": "none", "focal": [1]})
+    assert gates.focal_off(run) is None and gates.reprojection_p95_px(run) is None
+
+
 def test_gate_limits():
     assert Gate(least=0.5).holds(0.5) and not Gate(least=0.5).holds(0.49)
     assert Gate(0.1, 0.2).holds(0.15) and not Gate(0.1, 0.2).holds(0.3) and not Gate(most=1.0).holds(float("nan"))
@@ -127,6 +153,8 @@ def test_gates_of_a_real_result(tiny_run, tmp_path):
     run = RunFolder(tiny_run)
     values = {name: measure(run) for name, measure in gates.MEASURES.items()}
     assert 0.01 < values["reprojection_px"] < 0.4 and 0.01 < values["held_out_residual"] < 0.06
+    assert values["reprojection_px"] < values["reprojection_p95_px"] < 0.6 and values["focal_off"] == 0.0
+    assert 40 < values["rotation_range_deg"] < 70
     assert 0.5 < values["coverage"] < 1 and 0.5 < values["confidence"] < 1
     picture = run.work / gates.PICTURE
     review_picture.write_review(run, list(values), [f"{name} {value:.3f}" for name, value in values.items()])

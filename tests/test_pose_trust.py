@@ -8,7 +8,15 @@ from shared.bundle import BundleSolution, adjust, zoomed
 from shared.bundle_problem import Tracks
 from shared.geometry import project, rigid, rotation_from_vector
 from shared.solve.first_poses import LOSS, Adjusted
-from shared.solve.pose_trust import SHARED_ERRORS, noise_factor, rotations_apart, trust
+from shared.solve.focal_search import farther
+from shared.solve.pose_trust import (
+    FOCAL_DEVIATIONS,
+    SHARED_ERRORS,
+    focal_elsewhere,
+    noise_factor,
+    rotations_apart,
+    trust,
+)
 from shared.solve.tracked_clip import TrackedClip
 
 LENS = np.array([[1500.0, 0, 320], [0, 1500.0, 320], [0, 0, 1]])
@@ -129,6 +137,29 @@ def test_guessed_focal_length_is_solved_and_a_given_one_only_checked():
     assert abs(np.log(guessed.focal_gain * 1.06)) < 3 * guessed.focal_deviation
     assert guessed.adjusted.solution.focal_gain == guessed.focal_gain
     assert given.adjusted.solution.focal_gain == 1.0
+
+
+@pytest.mark.parametrize("wrong", [1 / 3, 0.5, 0.62, 2.0, 3.0])
+def test_focal_length_is_found_however_wrong_the_given_one_is(wrong):
+    """What head and poses become under the wrong lens, points nearly free to follow it."""
+    cloud, poses, lens = face(), turn(), zoomed(LENS, wrong)
+    tracks = Tracks.of_equal_noise(project(cloud, poses, LENS)[0] + noise(cloud, 12.0, 5), NOISE_PX)
+    start = farther(poses, cloud, wrong)
+    solution = adjust(tracks, start, cloud, lens, loss_scale=LOSS, prior_mm=1000.0, max_iterations=100)
+    last = all_reliable(tracks, solution)
+    elsewhere = focal_elsewhere(clip_of(lens), last)
+    trusted = trust(clip_of(lens), last, 10.0, False, elsewhere)
+    assert abs(np.log(trusted.focal_gain * wrong)) < 0.15
+    assert abs(np.log(trusted.focal_gain)) > FOCAL_DEVIATIONS * trusted.focal_deviation  # so that a warning says it
+
+
+@pytest.mark.parametrize("prior_mm", [10.0, 30.0])
+def test_right_focal_length_is_left_alone(prior_mm):
+    tracks, solution = solved(12.0, seed=4)
+    last = all_reliable(tracks, solution)
+    assert focal_elsewhere(clip_of(), last) is None
+    trusted = trust(clip_of(), last, prior_mm, estimate_focal=False)
+    assert abs(np.log(trusted.focal_gain)) < 3 * trusted.focal_deviation
 
 
 def test_held_poses_stay():

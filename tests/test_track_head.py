@@ -1,21 +1,56 @@
 """Poses of all frames from those of some: another tracker's, interpolated ones, and where landmarks know better."""
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pytest
 
+from shared.contract import main
+from shared.errors import InputError
 from shared.geometry import project, rigid, rotation_from_vector
+from shared.io.images import read_png, write_png
 from shared.solve import track_head
 from shared.solve.first_poses import interpolate_poses
 from shared.solve.pose_trust import rotations_apart
-from shared.solve.track_head import carried_poses, follow_landmarks
+from shared.solve.track_head import carried_poses, follow_landmarks, refuse_still_head
 from shared.solve.tracked_clip import TrackedClip
+from stages import sample_frames, track_landmarks
+
+TINY = Path(__file__).parent / "tiny"
 
 
 def some_poses(count, seed=0):
     rng = np.random.default_rng(seed)
     turn = rotation_from_vector(0.3 * rng.normal(size=(count, 3)))
     return rigid(turn, [0, 0, 900.0] + 20 * rng.normal(size=(count, 3)))
+
+
+def test_still_head_is_refused_with_what_to_film():
+    still = rigid(np.broadcast_to(np.diag([1.0, -1, -1]), (12, 3, 3)), np.tile([0.0, 0, 900.0], (12, 1)))
+    shaken = still + np.pad(np.random.default_rng(0).normal(0, 0.05, (12, 3, 1)), ((0, 0), (0, 1), (3, 0)))
+    for poses in (still, shaken):
+        with pytest.raises(InputError, match="does not turn.*25 degrees to each side.*poster"):
+            refuse_still_head(poses)
+    refuse_still_head(some_poses(5))
+
+
+def test_still_face_and_poster_end_with_exit_code_2(tmp_path, capsys):
+    """One frame again and again with noise: nothing turns. The stage refuses it, where it gave NaN or passed."""
+    rng, picture = np.random.default_rng(0), read_png(TINY / "frames" / "0005.png").astype(float)
+    (tmp_path / "still" / "frames").mkdir(parents=True)
+    for i in range(8):
+        noisy = np.clip(picture + rng.normal(0, 2, picture.shape), 0, 255).round().astype(np.uint8)
+        write_png(tmp_path / "still" / "frames" / f"{i:04d}.png", noisy)
+    shutil.copy(TINY / "subject.yaml", tmp_path / "still")
+    arguments = ["--subject", str(tmp_path / "still"), "--out", str(tmp_path / "out")]
+    fast = [part for value in ("start_frames=8", "references=1", "tracks=500") for part in ("--set", value)]
+    assert main(sample_frames.STAGE, sample_frames.run, sample_frames.check, arguments) == 0
+    stage = track_landmarks.STAGE, track_landmarks.run, track_landmarks.check
+    assert main(*stage, [*arguments, *fast]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "the head does not turn" in said and "25 degrees to each side" in said
 
 
 def test_held_poses_go_to_the_heads_space_in_its_unit():

@@ -5,6 +5,7 @@ pipeline.yaml sets the thresholds. A subject that misses one is finished all the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -41,14 +42,40 @@ def reprojection_px(run: RunFolder) -> float | None:
     return max((error for error, _ in tracking_errors(run)), default=None)
 
 
-def tracking_errors(run: RunFolder) -> list[tuple[float, RunFolder]]:
-    """reprojection_px of each clip, with its folder, where it is known."""
-    found = []
-    for clip in clips_of(run):
-        record = read_record(clip.published("track_landmarks") / "tracking.json") or {}
-        error = _number(record.get("reprojection_px", {}), "median")
-        found += [] if error is None else [(error, clip)]
-    return found
+def reprojection_p95_px(run: RunFolder) -> float | None:
+    """The same distance that 95 % of the skin points keep; of several clips the largest."""
+    return max((error for error, _ in tracking_errors(run, "p95")), default=None)
+
+
+def rotation_range_deg(run: RunFolder) -> float | None:
+    """Largest angle between two frames' views of the head; of several clips the smallest."""
+    found = [_number(record, "rotation_range_deg") for record, _ in tracking_records(run)]
+    return min((angle for angle in found if angle is not None), default=None)
+
+
+def focal_off(run: RunFolder) -> float | None:
+    """By how much the tracks ask for another focal length than the given one: logarithm, less three deviations of what
+    they know of it; of several clips the largest. 0 where it was solved."""
+    found = [_focal_off(record.get("focal")) for record, _ in tracking_records(run)]
+    return max((off for off in found if off is not None), default=None)
+
+
+def _focal_off(focal: object) -> float | None:
+    gain, deviation = _number(focal, "gain"), _number(focal, "log_deviation")
+    if gain is None or deviation is None or gain <= 0:
+        return None
+    return 0.0 if focal.get("solved") else max(abs(math.log(gain)) - 3.0 * deviation, 0.0)
+
+
+def tracking_errors(run: RunFolder, which: str = "median") -> list[tuple[float, RunFolder]]:
+    """reprojection_px of each clip, median or p95, with its folder, where it is known."""
+    found = [(_number(record.get("reprojection_px"), which), clip) for record, clip in tracking_records(run)]
+    return [(error, clip) for error, clip in found if error is not None]
+
+
+def tracking_records(run: RunFolder) -> list[tuple[dict, RunFolder]]:
+    """tracking.json of each clip, with its folder."""
+    return [(read_record(clip.published("track_landmarks") / "tracking.json") or {}, clip) for clip in clips_of(run)]
 
 
 def clips_of(run: RunFolder) -> list[RunFolder]:
@@ -78,7 +105,9 @@ def confidence(run: RunFolder) -> float | None:
 
 
 MEASURES: Mapping[str, Callable[[RunFolder], float | None]] = {
-    measure.__name__: measure for measure in (reprojection_px, held_out_residual, coverage, confidence)}
+    measure.__name__: measure for measure in (
+        reprojection_px, reprojection_p95_px, rotation_range_deg, focal_off, held_out_residual, coverage,
+        confidence)}
 
 
 def check_gates(pipeline: Pipeline) -> None:

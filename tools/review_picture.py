@@ -13,7 +13,7 @@ from shared.io.frames import FrameSet
 from shared.io.images import read_exr, read_png, write_png
 from shared.report.gather import compared_frames
 from shared.report.pictures import error_bytes, srgb_bytes, viridis_bytes
-from tools.gates import PICTURE, clips_of, confidence_map, tracking_errors
+from tools.gates import PICTURE, clips_of, confidence_map, tracking_errors, tracking_records
 
 WIDTH_PX, TITLE_PX, TILE_PX = 960, 36, 320
 _TEXT = (235, 235, 235)
@@ -21,7 +21,8 @@ _TEXT = (235, 235, 235)
 
 def write_review(run: RunFolder, gates: Sequence[str], titles: Sequence[str]) -> None:
     """work/review.png."""
-    panels = {"reprojection_px": _residuals, "held_out_residual": _worst_frames, "coverage": _confidence,
+    panels = {"reprojection_px": _residuals, "reprojection_p95_px": _residuals, "rotation_range_deg": _views,
+              "focal_off": _views, "held_out_residual": _worst_frames, "coverage": _confidence,
               "confidence": _confidence}
     rows = [_titled(title, _fitted(panels[gate](run))) for gate, title in zip(gates, titles, strict=True)]
     write_png(run.work / PICTURE, np.vstack(rows))
@@ -31,6 +32,12 @@ def _residuals(run: RunFolder) -> np.ndarray:
     """Where on the skin the tracks do not fit, of the clip that was tracked worst."""
     clip = max(tracking_errors(run), key=lambda pair: pair[0])[1]
     return read_png(clip.published("track_landmarks") / "residuals.png")
+
+
+def _views(run: RunFolder) -> np.ndarray:
+    """The tracked head in a few frames that lie far apart, of the clip that turns least."""
+    clip = min(tracking_records(run), key=lambda pair: pair[0].get("rotation_range_deg", np.inf))[1]
+    return read_png(clip.published("track_landmarks") / "overlay.png")
 
 
 def _worst_frames(run: RunFolder) -> np.ndarray:

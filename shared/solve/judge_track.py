@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.geometry import camera_centres
-from shared.mesh import normalised
+from shared.geometry import rotation_range_deg
 from shared.solve.pose_trust import FOCAL_DEVIATIONS, HELD_DEVIATIONS
 from shared.solve.track_head import HeadTrack
 
@@ -38,12 +37,6 @@ def judge_frames(track: HeadTrack, outlier_factor: float) -> tuple[np.ndarray, l
         else:
             reasons.append("")
     return np.array([not reason for reason in reasons]), reasons
-
-
-def rotation_range_deg(camera_from_head: np.ndarray) -> float:
-    """Largest angle between two frames' views of the head, in degrees."""
-    directions = normalised(camera_centres(camera_from_head))
-    return float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0))))
 
 
 def rotation_deviation_deg(track: HeadTrack, fits: np.ndarray) -> np.ndarray:

@@ -7,15 +7,16 @@ promise, gives the factor by which all noise is larger.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shared.bundle import BundleSolution, adjust, pose_covariance
+from shared.bundle import BundleSolution, adjust, pose_covariance, zoomed
 from shared.bundle_problem import Tracks
 from shared.geometry import nearest_rotation, vector_from_rotation
 from shared.motion_prior import motion_prior_of
 from shared.solve.first_poses import LOSS, Adjusted, adjust_clip
+from shared.solve.focal_search import PRIOR_MM, farther, look_elsewhere
 from shared.solve.tracked_clip import TrackedClip
 
 LEAST_HALF = 10
@@ -101,10 +102,33 @@ def _turns(rotations: np.ndarray) -> np.ndarray:
     return vector_from_rotation(rotations @ nearest_rotation(rotations.sum(0)).T)
 
 
-def trust(clip: TrackedClip, last: Adjusted, prior_mm: float, estimate_focal: bool) -> TrustedPoses:
+def focal_elsewhere(clip: TrackedClip, flow: Adjusted) -> tuple[float, float] | None:
+    """Another lens that the dense flow clearly asks for, not near the given one: its gain and its log's deviation.
+
+    The deviation is such that the given lens is as many away as the root of the fall of the cost says.
+    """
+    shown, solution = flow.reliable, flow.solution
+    poses = solution.camera_from_points[shown]
+    other = look_elsewhere(flow.tracks.subset(shown), poses, solution.points, clip.intrinsics, LOSS)
+    if other is None:
+        return None
+    lens = zoomed(clip.intrinsics, other.gain)
+    factor = SHARED_ERRORS * noise_factor(other.tracks, other.solution, lens, PRIOR_MM)
+    deviations = np.sqrt(other.advantage) / factor
+    return None if deviations < FOCAL_DEVIATIONS else (other.gain, float(abs(np.log(other.gain)) / deviations))
+
+
+def trust(
+    clip: TrackedClip,
+    last: Adjusted,
+    prior_mm: float,
+    estimate_focal: bool,
+    elsewhere: tuple[float, float] | None = None,
+) -> TrustedPoses:
     """The last adjustment, with noise as measured and the motion prior, and its covariance.
 
     estimate_focal: the focal length is a guess, so that the solved one is taken over where the clip determines it.
+    elsewhere: see focal_elsewhere; the tracks are then solved under that lens, where they alone would stay near theirs.
     """
     shown, solution = last.reliable, last.solution
     poses, time_s = solution.camera_from_points[shown], clip.time_s[shown]
@@ -118,7 +142,13 @@ def trust(clip: TrackedClip, last: Adjusted, prior_mm: float, estimate_focal: bo
     free = adjust(
         tracks, poses, points, lens, loss_scale=loss, prior_mm=prior_mm, motion=motion, refine_focal=True
     )
+    if elsewhere is not None:
+        gain, away = elsewhere[0], farther(poses, points, elsewhere[0])
+        free = adjust(tracks, away, points, zoomed(lens, gain), loss_scale=loss, prior_mm=PRIOR_MM, motion=motion)
+        free = replace(free, focal_gain=gain)
     uncertain = pose_covariance(free, tracks, lens, loss_scale=loss, motion=motion, with_focal=True)
+    if elsewhere is not None:
+        uncertain = replace(uncertain, log_focal=elsewhere[1])
     solve_focal = estimate_focal and not clip.hold_poses and uncertain.log_focal < LARGEST_FOCAL_DEVIATION
     solved = free if solve_focal else solved
     known = uncertain if solve_focal else pose_covariance(solved, tracks, lens, loss_scale=loss, motion=motion)

@@ -13,7 +13,8 @@ import numpy as np
 
 from shared.bundle import place_points, zoomed
 from shared.bundle_problem import Tracks
-from shared.geometry import camera_centres, project, rigid
+from shared.errors import InputError
+from shared.geometry import camera_centres, project, rigid, rotation_range_deg
 from shared.head_model import HeadModel
 from shared.mesh import normalised
 from shared.solve.depth_noise import DepthNoise, depth_noise
@@ -30,7 +31,7 @@ from shared.solve.first_poses import (
 )
 from shared.solve.fit_head import FitWeights, HeadFit, fit_codes, landmarks_on_points
 from shared.solve.fit_surface import fit_surface
-from shared.solve.pose_trust import trust
+from shared.solve.pose_trust import focal_elsewhere, trust
 from shared.solve.texture_tracking import TexturePass, coarse_pass, solve_texture, track_texture
 from shared.solve.tracked_clip import TrackedClip
 from shared.texture_tracks import Windows
@@ -40,6 +41,10 @@ LANDMARK_FRAMES = 15
 
 FOLLOW_TEXELS = 3.0
 """Half of what the coarse pass searches; landmarks jitter by less."""
+
+LEAST_ROTATION_DEG = 3.0
+"""Between the views that lie farthest apart: still faces and posters have 0.03 to 0.5, the smallest turn that gives a
+result that is right 13."""
 
 HELD_OUT_EVERY = 8
 """One fine track in so many is held out to judge the poses."""
@@ -99,11 +104,13 @@ def track_head(
     note(_summary("flow over landmarks", found))
     found = flow_over_head(few, model, _fit(few, model, found, settings)[0], found, settings.flow, progress)
     note(_summary("flow over the head", found))
+    elsewhere = focal_elsewhere(few, found)
 
     fit, _ = _fit(few, model, found, settings)
     poses, known = _onto_all(clip, model, chosen, fit, found)
     found = _texture_pass(clip, model, fit, poses, known, coarse_pass(clip.face_width_px), progress)
     note(_summary("tracks", found))
+    refuse_still_head(found.solution.camera_from_points[found.reliable])
     fine = TexturePass(
         settings.texel_px, True, settings.tracks, Windows(sigma=settings.window_sigma), settings.prior_mm
     )
@@ -117,7 +124,7 @@ def track_head(
             note(f"dropped: tracks kept aside went from {held_out[0]:.3f} to {held_out[1]:.3f} px")
             break
         found = finer
-    trusted = trust(clip, found, settings.prior_mm, settings.estimate_focal)
+    trusted = trust(clip, found, settings.prior_mm, settings.estimate_focal, elsewhere)
     found = trusted.adjusted
     note(f"noise factor {trusted.noise_factor:.2f}, focal length {trusted.focal_gain:.4f} of the given one")
     lens = zoomed(clip.intrinsics, trusted.focal_gain if trusted.focal_solved else 1.0)
@@ -140,6 +147,19 @@ def track_head(
         held_out_px=held_out,
         held_off=trusted.held_off,
     )
+
+
+def refuse_still_head(camera_from_head: np.ndarray) -> None:
+    """InputError for poses [F, 4, 4] that show the head from one side only: nothing then tells depth, lens or light."""
+    turned = rotation_range_deg(camera_from_head)
+    if not turned >= LEAST_ROTATION_DEG:
+        raise InputError(
+            "the head does not turn",
+            got=f"views that are {turned:.2f} degrees apart at most",
+            expected=f"{LEAST_ROTATION_DEG:g} degrees or more, better 50",
+            mend="film a head that turns 25 degrees to each side; where a poster, a screen or somebody else shows a "
+            "larger face than the person's, cover it or cut it off",
+        )
 
 
 def _onto_all(clip, model, chosen, fit, found) -> tuple[np.ndarray, np.ndarray]:
