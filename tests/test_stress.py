@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from shared.color import decode_srgb
-from shared.geometry import vector_from_rotation
+from shared.geometry import project, rigid, vector_from_rotation
 from shared.io.arrays import read_json, write_json
 from tools import stress
-from tools.stress_camera import Sensor, compressed, defocused, drift, photograph, smeared
+from tools.stress_camera import Sensor, compressed, defocused, drift, photograph, shaken, smeared
 from tools.stress_dials import DIALS, Case, Dial
 from tools.stress_judge import FAILED, LIMITS, RIGHT, SAID, SILENT, WARNED, judge
 from tools.stress_subject import sliding_landmarks, wrong_poses
@@ -53,6 +53,38 @@ def test_drifts_are_as_wide_as_stated():
     assert np.abs(white[:, 1]).max() == 0.0 and np.allclose(white[:, 0], -white[:, 2], atol=1e-6)
     bands = np.log(drift(Sensor(bands=0.2), 3, 40, 200))[:, 0]
     assert np.ptp(bands, axis=0).max() == pytest.approx(0.4, rel=0.05)
+
+
+def test_flicker_changes_whole_frames_from_one_to_the_next():
+    gains = np.stack([np.log(drift(Sensor(flicker=0.15), i, 40, 8)) for i in range(40)])[:, :, 0]
+    assert np.abs(gains).max() == pytest.approx(0.15, rel=0.02) and np.ptp(gains, axis=(1, 2)).max() < 1e-6
+    assert np.abs(np.diff(gains[:, 0, 0])).mean() > 0.1
+
+
+def test_log_curve_lifts_the_dark():
+    half, whole = (next(photograph(GREY, STILL, Sensor(log_curve=s, **NO_NOISE)))[0, 0, 0] for s in (0.5, 1.0))
+    plain = next(photograph(GREY, STILL, Sensor(**NO_NOISE)))[0, 0, 0]
+    assert plain < half < whole == round(255 * np.log(41.0) / np.log(201.0))
+    for light in (0.0, 1.0):
+        codes = next(photograph(GREY * 0 + np.float16(light), STILL, Sensor(log_curve=1.0, **NO_NOISE)))
+        assert (codes == round(255 * light)).all()
+
+
+def test_a_shaking_camera_moves_pictures_as_its_poses_say():
+    """A spot on the head is found where the turned pose projects it; frames with truth stay."""
+    lens, point = np.array([[300.0, 0, 40], [0, 300.0, 40], [0, 0, 1]]), np.array([[6.0, -3.0, 0.0]])
+    poses = rigid(np.tile(np.eye(3), (6, 1, 1)), np.tile([0.0, 0, 600.0], (6, 1)))
+    rows, columns = np.mgrid[0:80, 0:80] + 0.5
+
+    def spot(pose):
+        place = project(point, pose, lens)[0].ravel()
+        return np.exp(-((columns - place[0]) ** 2 + (rows - place[1]) ** 2) / 18.0)[..., None].repeat(3, axis=2)
+
+    pictures = np.stack([spot(pose) for pose in poses]).astype(np.float32)
+    moved, turned = shaken(pictures, poses, lens, 4.0, np.array([0, 3]))
+    assert np.array_equal(turned[[0, 3]], poses[[0, 3]]) and np.allclose(moved[[0, 3]], pictures[[0, 3]], atol=1e-4)
+    expected = np.stack([spot(pose) for pose in turned])
+    assert np.abs(moved - expected).max() < 0.03 < np.abs(pictures - expected)[[1, 2, 4, 5]].max()
 
 
 def test_compression_is_worse_the_lower_its_quality():

@@ -10,6 +10,7 @@ import pytest
 from shared.contract import main
 from shared.errors import InputError
 from shared.geometry import project, rigid, rotation_from_vector
+from shared.io.arrays import load_arrays
 from shared.io.images import read_png, write_png
 from shared.solve import track_head
 from shared.solve.first_poses import interpolate_poses
@@ -51,6 +52,24 @@ def test_still_face_and_poster_end_with_exit_code_2(tmp_path, capsys):
     assert main(*stage, [*arguments, *fast]) == 2
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert "the head does not turn" in said and "25 degrees to each side" in said
+
+
+def test_mirrored_pictures_give_the_mirrored_poses(tiny_run, tmp_path):
+    """Nothing in the pictures tells that they are mirrored: what comes out is right for the head in the mirror."""
+    (tmp_path / "mirrored" / "frames").mkdir(parents=True)
+    for path in (TINY / "frames").iterdir():
+        write_png(tmp_path / "mirrored" / "frames" / path.name, np.ascontiguousarray(read_png(path)[:, ::-1]))
+    shutil.copy(TINY / "subject.yaml", tmp_path / "mirrored")
+    arguments = ["--subject", str(tmp_path / "mirrored"), "--out", str(tmp_path / "out")]
+    assert main(sample_frames.STAGE, sample_frames.run, sample_frames.check, arguments) == 0
+    assert main(track_landmarks.STAGE, track_landmarks.run, track_landmarks.check, arguments) == 0
+    found, straight = (load_arrays(folder / "work" / "track_landmarks" / "poses.npz")
+                       for folder in (tmp_path / "out" / "mirrored", tiny_run))
+    assert np.array_equal(found["frame_index"], straight["frame_index"])
+    mirror = np.diag([-1.0, 1, 1])
+    apart = rotations_apart(found["camera_from_head"][:, :3, :3],
+                            mirror @ straight["camera_from_head"][:, :3, :3] @ mirror)
+    assert np.degrees(np.sqrt((apart**2).sum(1).mean())) < 0.75
 
 
 def test_held_poses_go_to_the_heads_space_in_its_unit():

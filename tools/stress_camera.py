@@ -12,12 +12,18 @@ import cv2
 import numpy as np
 
 from shared.color import encode_srgb
-from shared.geometry import project
+from shared.geometry import project, rotation_from_vector
 
 DRIFT_CYCLES = (1.0, 2.3)
 """Slow waves over the clip that automatic exposure and white balance follow."""
 BANDS = 2.0
 """Bands that a lamp on mains leaves in a picture under a rolling shutter."""
+
+FLICKER_CYCLES = 0.37
+"""A frame: a lamp on mains beside the shutter's rate."""
+LOG_GAIN = 200.0
+"""Of the logarithmic curve log(1 + gain x): the dark half of the codes shows a hundredth of the light, as footage that
+is meant to be graded does."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +32,9 @@ class Sensor:
 
     defocus_px: radius of the lens's disc. motion_px: length of the smear where the head turns fastest.
     exposure_drift, white_drift, bands: amplitude of the gain's logarithm over time, between red and blue, over rows.
-    gamma: exponent between the light and what the stated transfer function reads. jpeg: quality, 0: none.
+    flicker: amplitude of the gain's logarithm from one frame to the next.
+    gamma: exponent between the light and what the stated transfer function reads. log_curve: share of a logarithmic
+    curve in the codes. jpeg: quality, 0: none.
     """
 
     exposure: float = 1.0
@@ -37,7 +45,9 @@ class Sensor:
     exposure_drift: float = 0.0
     white_drift: float = 0.0
     bands: float = 0.0
+    flicker: float = 0.0
     gamma: float = 1.0
+    log_curve: float = 0.0
     jpeg: int = 0
 
 
@@ -54,13 +64,22 @@ def photograph(pictures: np.ndarray, motion_px: np.ndarray, sensor: Sensor, seed
         light = light * drift(sensor, number, len(pictures), len(light))
         noise = np.sqrt(sensor.shot_noise**2 * np.clip(light, 0.0, 1.0) + sensor.read_noise**2)
         counted = np.clip(light + noise * rng.normal(size=light.shape), 0.0, 1.0)
-        yield compressed(np.uint8(np.round(255 * encode_srgb(counted**sensor.gamma))), sensor.jpeg)
+        yield compressed(np.uint8(np.round(255 * encoded(counted, sensor))), sensor.jpeg)
+
+
+def encoded(light: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Light 0 to 1 -> codes 0 to 1."""
+    codes = encode_srgb(light**sensor.gamma)
+    if not sensor.log_curve:
+        return codes
+    return (1.0 - sensor.log_curve) * codes + sensor.log_curve * np.log1p(LOG_GAIN * light) / np.log1p(LOG_GAIN)
 
 
 def drift(sensor: Sensor, number: int, count: int, rows: int) -> np.ndarray:
     """[rows, 1, 3] gain of a frame."""
     wave = np.sin(2 * np.pi * np.outer(DRIFT_CYCLES, number / count) + [[0.4], [1.9]]).ravel()
     log_gain = np.zeros((rows, 1, 3)) + sensor.exposure_drift * wave[0]
+    log_gain += sensor.flicker * np.sin(2 * np.pi * FLICKER_CYCLES * number)
     log_gain += sensor.white_drift * wave[1] * np.array([1.0, 0.0, -1.0])
     phase = BANDS * np.arange(rows) / rows + 0.17 * number
     return np.exp(log_gain + (sensor.bands * np.sin(2 * np.pi * phase))[:, None, None]).astype(np.float32)
@@ -99,6 +118,27 @@ def compressed(codes: np.ndarray, quality: int) -> np.ndarray:
                cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420)
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(codes[..., ::-1]), options)
     return np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
+
+
+def shaken(
+    pictures: np.ndarray, poses: np.ndarray, intrinsics: np.ndarray, shake_px: float, still: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures [F, H, W, 3] and poses [F, 4, 4] from a camera held by hand that turns by some shake_px.
+
+    The turn differs from frame to frame; frames whose index is in `still` keep their place.
+    """
+    count, focal = len(pictures), intrinsics[0, 0]
+    turn = np.random.default_rng(7).normal(size=(count, 2)) * shake_px / focal
+    turn[still] = 0.0
+    rotation = rotation_from_vector(np.column_stack([turn, np.zeros(count)]))
+    warp = intrinsics @ rotation @ np.linalg.inv(intrinsics)
+    half = np.array([[1.0, 0, 0.5], [0, 1.0, 0.5], [0, 0, 1]])  # OpenCV's pixel centres are whole numbers
+    size = pictures.shape[2], pictures.shape[1]
+    moved = [cv2.warpPerspective(picture, np.linalg.inv(half) @ way @ half, size, flags=cv2.INTER_CUBIC,
+                                 borderMode=cv2.BORDER_REPLICATE) for picture, way in zip(pictures, warp, strict=True)]
+    turned = np.array(poses)
+    turned[:, :3] = rotation @ poses[:, :3]
+    return np.maximum(np.stack(moved), 0.0), turned
 
 
 def image_motion(camera_from_head: np.ndarray, intrinsics: np.ndarray, points: np.ndarray) -> np.ndarray:

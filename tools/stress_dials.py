@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 
 from tools.stress_camera import Sensor
 from tools.stress_takes import SETTINGS, Take
+from tools.synthesize import SENSOR_MM
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Case:
 
     pose_error_deg: of poses that come with the subject and are held. landmark_slide: how far landmarks that come with
     the subject lie off at the widest turn, as a share of the face's width; None: none come. keep: how many frames are
-    left, 0: all.
+    left, 0: all. shake_px: turn of the camera from frame to frame.
     """
 
     mix: tuple[tuple[Take, float], ...] = ((Take(), 1.0),)
@@ -32,6 +33,7 @@ class Case:
     pose_error_deg: float = 0.0
     landmark_slide: float | None = None
     keep: int = 0
+    shake_px: float = 0.0
 
     @property
     def digest(self) -> str:
@@ -71,10 +73,16 @@ DIALS = (
          lambda s: _shot(gamma=1.0 + s), r"transfer"),
     Dial("white_drift", "white balance that drifts", "log gain, red over green", (0.04, 0.2),
          lambda s: _shot(white_drift=s), r"white balance|colour (wanders|changes|drifts)"),
-    Dial("exposure_drift", "exposure that drifts", "log gain", (0.08, 0.4),
+    Dial("exposure_drift", "exposure that drifts", "log gain", (0.08, 0.4, 0.6),
          lambda s: _shot(exposure_drift=s), r"exposure|brightness wanders"),
     Dial("bands", "bands of a lamp on mains under a rolling shutter", "log gain", (0.05, 0.2),
          lambda s: _shot(bands=s), r"flicker|bands|brightness wanders"),
+    Dial("flicker", "light that flickers from frame to frame", "log gain", (0.05, 0.15),
+         lambda s: _shot(flicker=s), r"flicker|bands|brightness wanders"),
+    Dial("log_footage", "log-like footage that is stated to be sRGB", "share of the log curve", (0.2, 1.0),
+         lambda s: _shot(log_curve=s), r"transfer"),
+    Dial("shake", "a camera that shakes in the hand", "px from frame to frame", (2.0, 8.0),
+         lambda s: Case(shake_px=s), r"shak|camera moves|do not fit"),
     Dial("defocus", "focus that misses the face", "px", (1.2, 3.5),
          lambda s: _shot(defocus_px=s), r"blur|focus|sharp"),
     Dial("motion_blur", "a slow shutter", "px at the fastest turn", (3.0, 9.0),
@@ -95,8 +103,12 @@ DIALS = (
          lambda s: _seen(fringe=s), r"glasses|hair|covers|in front of"),
     Dial("smile", "an expression that changes mid-clip", "strength", (0.4, 1.0),
          lambda s: _seen(smile=s), r"expression|mouth|do not fit"),
-    Dial("wrong_focal", "a wrong focal length", "log of stated over true", (0.1, 0.3),
+    Dial("wrong_focal", "a focal length given too long", "log of stated over true", (0.1, 0.3, math.log(3.0)),
          lambda s: Case(focal_gain=math.exp(s)), r"focal"),
+    Dial("short_focal", "a focal length given too short", "log of true over stated", (0.3, math.log(3.0)),
+         lambda s: Case(focal_gain=math.exp(-s)), r"focal"),
+    Dial("swapped_lens", "focal length and sensor width swapped", "of 1", (1.0,),
+         lambda s: Case(focal_gain=math.exp(s * 2.0 * math.log(SENSOR_MM / SETTINGS.focal_mm))), r"focal"),
     Dial("narrow_turn", "a turn too small", "degrees short of the usual 27", (15.0, 22.0),
          lambda s: _seen(yaw_deg=27.0 - s, pitch_deg=max(12.0 - 0.5 * s, 2.0)), r"changes by only|turn"),
     Dial("wide_turn", "a wide turn", "degrees beyond the usual 27", (18.0,),

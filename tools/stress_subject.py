@@ -12,7 +12,7 @@ from shared.geometry import project, rotation_from_vector
 from shared.io.arrays import load_arrays, save_arrays
 from shared.io.images import read_exr, write_png
 from tools import synth_output
-from tools.stress_camera import image_motion, photograph
+from tools.stress_camera import image_motion, photograph, shaken
 from tools.stress_dials import Case
 from tools.stress_takes import SETTINGS, camera, render_take
 from tools.synth_head import smooth_random
@@ -35,10 +35,13 @@ def make_subject(case: Case, folder: Path, takes: Path) -> Path:
     kept = _kept(truth["gt_frames"], len(poses), case.keep)
     pictures = sum(gain * np.load(path / "radiance.npy", mmap_mode="r")[kept].astype(np.float32)
                    for path, gain in parts)
+    known = np.nonzero(np.isin(kept, truth["gt_frames"]))[0]
+    if case.shake_px:
+        pictures, poses[kept] = shaken(pictures, poses[kept], camera().intrinsics, case.shake_px, known)
     motion = image_motion(poses, camera().intrinsics, points)[kept]
     for number, codes in enumerate(photograph(pictures, motion, case.sensor)):
         write_png(folder / (VIDEO % number), codes)
-    _write_truth(folder / "gt", parts, kept)
+    _write_truth(folder / "gt", parts, kept, poses)
     tracking = _given_tracking(case, folder, poses[kept], points)
     synth_output.write_description(folder, camera(), SETTINGS.focal_mm, SENSOR_MM, len(kept), FPS, VIDEO)
     description = yaml.safe_load((folder / "subject.yaml").read_text(encoding="utf-8"))
@@ -59,8 +62,8 @@ def _kept(truth: np.ndarray, count: int, keep: int) -> np.ndarray:
     return np.union1d(truth, more)
 
 
-def _write_truth(folder: Path, parts: list[tuple[Path, float]], kept: np.ndarray) -> None:
-    """gt/: the first take's, of the frames that are left, and the light that stands still."""
+def _write_truth(folder: Path, parts: list[tuple[Path, float]], kept: np.ndarray, poses: np.ndarray) -> None:
+    """gt/: the first take's, of the frames that are left, with all frames' poses, and the light that stands still."""
     source = parts[0][0] / "gt"
     truth = load_arrays(source / "poses.npz")
     for file in source.iterdir():
@@ -71,7 +74,7 @@ def _write_truth(folder: Path, parts: list[tuple[Path, float]], kept: np.ndarray
     for frame in known:
         for file in (source / "frames").glob(f"{frame:04d}_*"):
             (folder / "frames" / f"{numbers[frame]:04d}_{file.name[5:]}").symlink_to(file.resolve())
-    save_arrays(folder / "poses.npz", camera_from_head=truth["camera_from_head"][kept], K=truth["K"],
+    save_arrays(folder / "poses.npz", camera_from_head=poses[kept], K=truth["K"],
                 gt_frames=np.array([numbers[frame] for frame in known], np.int64))
     still = [(path, gain) for path, gain in parts if not path.name.startswith("cap")]
     light = sum(gain * read_exr(path / "gt" / "envmap.exr") for path, gain in still)
