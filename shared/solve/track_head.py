@@ -43,8 +43,8 @@ FOLLOW_TEXELS = 3.0
 """Half of what the coarse pass searches; landmarks jitter by less."""
 
 LEAST_ROTATION_DEG = 3.0
-"""Between the views that lie farthest apart: still faces and posters have 0.03 to 0.5, the smallest turn that gives a
-result that is right 13."""
+"""Between the views that lie farthest apart: a still face has hundredths, the smallest turn that gives a result that is
+right 13."""
 
 HELD_OUT_EVERY = 8
 """One fine track in so many is held out to judge the poses."""
@@ -104,6 +104,7 @@ def track_head(
     note(_summary("flow over landmarks", found))
     found = flow_over_head(few, model, _fit(few, model, found, settings)[0], found, settings.flow, progress)
     note(_summary("flow over the head", found))
+    refuse_still_head(found.solution.camera_from_points[found.reliable])
     elsewhere = focal_elsewhere(few, found)
 
     fit, _ = _fit(few, model, found, settings)
