@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 @pytest.fixture(scope="session")
 def tiny_run(tmp_path_factory):
     """The folder (work/ and export/) of the tiny subject, from clip to export."""
-    from tools.goldens import run_tiny
+    from tools.goldens.tiny import run_tiny
 
     return run_tiny(tmp_path_factory.mktemp("tiny_run"))
 

@@ -11,7 +11,7 @@ from shared.io.arrays import load_arrays
 from shared.io.images import read_png, write_png
 from tools import perturb
 from tools.bench_tracking import COLUMNS, main, measure, write_table
-from tools.goldens import TINY_SUBJECT
+from tools.goldens.tiny import TINY_SUBJECT
 
 
 def grey(value=120, size=40):

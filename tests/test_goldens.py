@@ -1,60 +1,85 @@
-"""Every stage on the tiny subject against its golden file (tools/goldens.py writes them)."""
+"""Every stage, from inputs of its own, against its golden file, under several kernels and thread counts.
+
+`python -m tools.goldens write` makes the files; tolerances are multiples of the spread over those ways to run.
+"""
+
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+from slow import SLOW
 
-from shared.io.arrays import read_json
-from tools import goldens
-
-RELATIVE, ABSOLUTE = 0.02, 0.004
-"""Results differ between processors in the last digits, which matching, robust weights and thresholds amplify; a change
-of method shows in the first two digits."""
-
-LOOSE = {"covariance": 0.5, "points_head": 0.1, "residual_px": 0.5}
-"""Sampled values that follow which single tracks survive a threshold."""
-
-
-@pytest.fixture(scope="module", params=goldens.STAGES)
-def stage(request):
-    return request.param
+from tools.goldens.chain import chain_differences
+from tools.goldens.golden import differences, distance, read_golden, run_all, run_from_inputs
+from tools.goldens.inputs import kept_folder, stage_of
+from tools.goldens.kernels import LEAST, OWN, WAYS
+from tools.goldens.measures import Measure
+from tools.goldens.mutations import MUTATIONS, noticed_by
+from tools.goldens.tiny import SETTINGS, STAGES
 
 
 @pytest.fixture(scope="module")
-def golden(stage):
-    return read_json(goldens.GOLDEN_FOLDER / f"{stage}.json")
+def runs(tmp_path_factory):
+    """{(stage, way): run}; two stages at once, each a process of its own."""
+    return run_all(STAGES, WAYS, tmp_path_factory.mktemp("goldens"), at_once=2)
 
 
-@pytest.fixture(scope="module")
-def result(stage, tiny_run):
-    return goldens.summarise(goldens.stage_folder(tiny_run, stage), stage)
+@pytest.mark.parametrize("stage", STAGES)
+def test_versions_of_the_golden_file_are_the_stages(stage):
+    golden = read_golden(stage)
+    assert golden["version"] == stage_of(stage).version
+    assert all(stage_of(name).version == number for name, number in golden["before"].items())
 
 
-def test_versions_of_the_golden_file_are_the_stages(stage, golden):
-    assert golden["version"] == goldens.version(stage)
-    assert all(goldens.version(name) == number for name, number in golden["before"].items())
+@pytest.mark.parametrize("way", [way.name for way in WAYS])
+@pytest.mark.parametrize("stage", STAGES)
+def test_the_same_comes_out(stage, way, runs):
+    golden, run = read_golden(stage), runs[stage, way]
+    assert list(run.files) == golden["files"]
+    assert not list(differences(stage, run.measures, golden))
 
 
-def test_the_same_files_are_made(golden, result):
-    assert result["files"] == golden["files"]
-    assert result["content"].keys() == golden["content"].keys()
+def test_the_chain_is_as_good_as_it_was(tiny_run):
+    assert not list(chain_differences(tiny_run / "export"))
 
 
-def test_the_same_numbers_come_out(golden, result):
-    wrong = []
-    for name, expected in golden["content"].items():
-        for key, values, reference in _leaves(name, result["content"][name], expected):
-            scale = max(float(np.abs(reference).max()), ABSOLUTE)
-            tolerance = LOOSE.get(key.split(":")[-1].split(".")[0], RELATIVE)
-            error = float(np.abs(values - reference).max()) / scale if values.shape == reference.shape else np.inf
-            if error > tolerance:
-                wrong.append(f"{key}: off by {100 * error:.1f} % of its largest value")
-    assert not wrong, "\n".join(wrong)
+@pytest.mark.parametrize("mutation", [m for m in MUTATIONS if m.quick or SLOW], ids=lambda m: m.name)
+def test_a_changed_constant_is_noticed(mutation):
+    assert noticed_by(mutation)
 
 
-def _leaves(name, found, expected):
-    """(key, found values, golden values) for everything numeric below one file's entry."""
-    for part, reference in expected.items():
-        if isinstance(reference, dict):
-            yield from _leaves(f"{name}:{part}", found[part], reference)
-        else:
-            yield f"{name}.{part}", np.asarray(found[part], float), np.asarray(reference, float)
+def test_inputs_stay_small():
+    sizes = [sum(path.stat().st_size for path in kept_folder(stage).rglob("*") if path.is_file())
+             for stage in STAGES[:-1]]
+    assert min(sizes) > 0 and sum(sizes) < 3e6
+
+
+def test_differences_are_told_from_the_same():
+    reference = Measure(np.array([1.0, 2.0]), np.array([0.1, 1.0]))
+    assert distance(reference, reference) == 0.0
+    assert np.isclose(distance(Measure(np.array([1.05, 2.1])), reference), 0.5)
+    assert distance(Measure(np.array([1.0])), reference) == np.inf
+    assert distance(Measure(np.array([np.nan, 2.0])), reference) == np.inf
+    words = Measure(np.array(["a", "b"]), exact=True)
+    assert distance(words, words) == 0.0 and distance(Measure(np.array(["a", "c"]), exact=True), words) == np.inf
+
+
+def test_a_kernel_reaches_the_libraries(tmp_path):
+    """What the environment says is what they use: a switch that nobody reads would make all ways one."""
+    words = ("import torch, numpy, cv2, llvmlite.binding, numba; from numpy._core._multiarray_umath import "
+             "__cpu_features__ as f; print(torch.backends.cpu.get_cpu_capability(), f['X86_V3'], numba.config.CPU_NAME, "
+             "'*AVX2?' in cv2.getCPUFeaturesLine().split() or 'AVX2' not in cv2.getCPUFeaturesLine())")
+    told = {}
+    for way in (OWN, LEAST):
+        done = subprocess.run([sys.executable, "-c", words], env=way.variables(), capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        told[way.name] = done.stdout.split()
+    assert told[LEAST.name][0] == "DEFAULT" and told[LEAST.name][1:] == ["False", "generic", "True"]
+    assert told[OWN.name][2] == "None"
+
+
+def test_a_stage_that_fails_says_so(tmp_path, monkeypatch):
+    monkeypatch.setitem(SETTINGS, "init_albedo", ("size=7",))
+    with pytest.raises(RuntimeError, match="init_albedo .own. ended with exit code 2"):
+        run_from_inputs("init_albedo", tmp_path)

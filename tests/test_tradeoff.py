@@ -15,7 +15,7 @@ from shared.contract.subject import load_subject
 from shared.errors import InputError
 from shared.io.arrays import load_arrays, read_json, save_arrays, write_json
 from tools import chart, tradeoff_runs
-from tools.goldens import TINY_SUBJECT
+from tools.goldens.tiny import TINY_SUBJECT
 from tools.score import camera_intrinsics, score
 from tools.tradeoff_cases import ABLATIONS, GROUPS, PEER, PRESET, QUICK, ChartCase, all_cases, chosen_cases
 from tools.tradeoff_rows import Rows, csv_row, higher_is_better, pareto_front, row_costs, summarise

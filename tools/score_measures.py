@@ -126,7 +126,7 @@ def envmap_errors(truth: np.ndarray, result: np.ndarray) -> dict:
     Compared through two kernels: the clamped cosine (what a matte surface sees) and a lobe of about 25 degrees (what
     skin reflects). `_front` keeps only directions that can light the visible side.
     """
-    directions, solid_angle = _latlong_directions(*truth.shape[:2])
+    directions, solid_angle = latlong_directions(*truth.shape[:2])
     cosine = directions @ directions.T
     kernels = {"irradiance": np.clip(cosine, 0, 1), "lobe25": np.exp(ENVMAP_LOBE_SHARPNESS * (cosine - 1))}
     regions = {"": np.ones(len(directions), bool), "_front": directions[:, 2] > FRONT_LIMIT}
@@ -145,7 +145,7 @@ def envmap_errors(truth: np.ndarray, result: np.ndarray) -> dict:
     return scores
 
 
-def _latlong_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+def latlong_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """World directions [h*w,3] of lat-long pixels and their share of the sphere [h*w]."""
     polar = np.pi * (np.arange(height)[:, None] + 0.5) / height
     azimuth = 2 * np.pi * (np.arange(width)[None] + 0.5) / width
