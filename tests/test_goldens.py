@@ -68,7 +68,8 @@ def test_differences_are_told_from_the_same():
 def test_a_kernel_reaches_the_libraries(tmp_path):
     """What the environment says is what they use: a switch that nobody reads would make all ways one."""
     words = ("import torch, numpy, cv2, llvmlite.binding, numba; from numpy._core._multiarray_umath import "
-             "__cpu_features__ as f; print(torch.backends.cpu.get_cpu_capability(), f['X86_V3'], numba.config.CPU_NAME, "
+             "__cpu_features__ as f; print(torch.backends.cpu.get_cpu_capability(), f['X86_V3'], "
+             "numba.config.CPU_NAME, "
              "'*AVX2?' in cv2.getCPUFeaturesLine().split() or 'AVX2' not in cv2.getCPUFeaturesLine())")
     told = {}
     for way in (OWN, LEAST):
