@@ -1,5 +1,7 @@
 # make demo    set-up, then the embedded subject from clip to scores
-# make test    set-up, then all tests
+# make test    set-up, then the lint and all tests
+# make test-random  the tests in a random order; SEED=N: that order again
+# make test-files   each test file by itself
 # make setup   the set-up alone
 # make chart   set-up, then speed against accuracy on the embedded subject (15 minutes); CASES=all SUBJECT=DIR: more
 # make stress  set-up, then where Limn fails and whether it says so (an hour on one core; goes on where it was stopped)
@@ -11,8 +13,9 @@ STAMP := $(VENV)/.installed
 INSTALL := $(BIN)/python -m pip install --quiet --require-hashes --no-deps --no-build-isolation
 CASES ?= quick
 OUT ?= build/chart
+SEED ?= $(shell date +%s)
 
-.PHONY: setup demo test chart stress lint audit clean
+.PHONY: setup demo test test-random test-files chart stress lint audit clean
 
 setup: $(STAMP)
 	$(BIN)/python -m tools.check_host
@@ -33,8 +36,14 @@ $(STAMP): requirements-build.lock requirements.lock requirements-torch-cpu.lock 
 demo: setup
 	$(BIN)/python -m tools.demo
 
-test: setup
+test: setup lint
 	$(BIN)/python -m pytest
+
+test-random: setup
+	$(BIN)/python -m pytest --order-seed $(SEED)
+
+test-files: setup
+	tools/test_files.sh
 
 chart: setup
 	$(BIN)/python -m tools.chart $(SUBJECT) --cases $(CASES) --out $(OUT)
