@@ -1,10 +1,9 @@
-"""The corpus of bad inputs, as far as it is refused quickly: one clear line, exit code 2, nothing written.
+"""The corpus of bad inputs, as far as it is refused: one clear line, exit code 2, nothing written.
 
-`python tests/bad_inputs/measure.py` runs all of it to the end, those that give a result too.
+`python tests/bad_inputs/measure.py` runs all of it to the end, those that give a result too, and takes the time.
 """
 
 import re
-import time
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +19,6 @@ from shared.errors import InputError
 from shared.io.given_tracking import read_given_landmarks, read_given_poses
 from shared.io.models import load_face_networks
 from tools.limn import main
-
-LONGEST_S = 30.0
 
 
 def refused(at):
@@ -58,9 +55,8 @@ def test_refused_before_anything_starts(tmp_path, capsys, name):
         folder, arguments = arguments[arguments.index("--subject") + 1], []
     out = [] if "--in-place" in arguments else ["--out", str(tmp_path / "out")]
     before = contents(tmp_path)
-    start = time.monotonic()
     code = main(["run", str(folder), *out, *(word for word in arguments if word != "--in-place")])
-    assert code == 2 and time.monotonic() - start < LONGEST_S
+    assert code == 2
     line = told(capsys, CASES[name].words)
     assert line.isprintable() and len(line) < 2000
     assert contents(tmp_path) == before and not (tmp_path / CANARY).exists() and not Path(CANARY).exists()
@@ -71,10 +67,10 @@ def test_refused_by_sample_frames(tmp_path, capsys, networks, name):
     from stages import sample_frames
 
     CASES[name].build(tmp_path / "subject")
-    before, start = contents(tmp_path), time.monotonic()
+    before = contents(tmp_path)
     arguments = ["--subject", str(tmp_path / "subject"), "--out", str(tmp_path / "out"), "--threads", "1"]
     code = stage_main(sample_frames.STAGE, sample_frames.run, sample_frames.check, arguments)
-    assert code == 2 and time.monotonic() - start < LONGEST_S
+    assert code == 2
     told(capsys, CASES[name].words)
     assert contents(tmp_path) == before
 
@@ -83,13 +79,12 @@ def test_refused_by_sample_frames(tmp_path, capsys, networks, name):
 def test_imports_that_are_refused(tmp_path, name):
     CASES[name].build(tmp_path / "subject")
     subject, index = load_subject(tmp_path / "subject"), np.arange(12)
-    start = time.monotonic()
     with pytest.raises(InputError, match=CASES[name].words) as caught:
         if subject.poses:
             read_given_poses(subject.poses, index)
         else:
             read_given_landmarks(subject.landmarks, index, (0.0, 0.0, 1.0))
-    assert "\n" not in str(caught.value) and time.monotonic() - start < LONGEST_S
+    assert "\n" not in str(caught.value)
     assert not Path(CANARY).exists()
 
 

@@ -74,7 +74,7 @@ def test_status_shows_a_running_stage(pipeline, tmp_path, capsys):
         assert main(arguments) == 0
         text = capsys.readouterr().out
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=20)
+    process.communicate(timeout=120)
     assert "a run works on it" in text and re.search(r"count_words +running", text)
     assert re.search(r"since \d+ s: pause \d+/300", text)
     assert main(arguments) == 0

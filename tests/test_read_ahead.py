@@ -19,7 +19,7 @@ def test_results_come_in_order_and_loading_runs_ahead():
     found = []
     for result in read_ahead(map(load, range(4))):
         if not found:
-            assert second.wait(timeout=20.0)  # the second is loaded while the first is held
+            assert second.wait(timeout=300.0)  # the second is loaded while the first is held
         found.append(result)
     assert found == [0, 10, 20, 30] and begun == [0, 1, 2, 3]
     assert list(read_ahead([])) == []
@@ -44,7 +44,7 @@ def test_calls_are_made_in_order_beside_the_caller():
     made, go_on = [], threading.Event()
 
     def call(item):
-        assert go_on.wait(timeout=20.0)
+        assert go_on.wait(timeout=300.0)
         made.append(item)
 
     with write_behind() as write:

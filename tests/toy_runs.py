@@ -54,7 +54,7 @@ def limn_process(*arguments, **environment):
 def limn(*arguments, **environment):
     """Runs limn; returns (exit code, what it printed)."""
     process = limn_process(*arguments, **environment)
-    output, _ = process.communicate(timeout=60)
+    output, _ = process.communicate(timeout=300)
     return process.returncode, output
 
 

@@ -18,7 +18,7 @@ STAGE = Stage(
     outputs=(Output("words.json", "{word: count}"), Output("when.json", "time of the run", volatile=True)),
     parameters=(
         Parameter("least", int, 1, "Fewest occurrences.", "words", 1, 100),
-        Parameter("pause_s", float, 0.0, "Pause before the counting.", "s", 0.0, 60.0),
+        Parameter("pause_s", float, 0.0, "Pause before the counting.", "s", 0.0, 600.0),
         Parameter("hoard_mb", int, 0, "Memory to hold meanwhile.", "MB", 0, 4000),
     ),
 )
