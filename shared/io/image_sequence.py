@@ -11,7 +11,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 
 from shared.errors import InputError
-from shared.io.images import exr_size, read_exr
+from shared.io.exr_picture import ExrPicture
 from shared.io.pixel_format import has_alpha
 from shared.io.source import (
     DEFAULT_FPS,
@@ -40,7 +40,8 @@ def is_sequence(path: Path | str) -> bool:
 class ImageSequenceReader:
     """Image files counted by a pattern; the lowest number is frame 0, a gap in the numbers a gap in time.
 
-    An EXR counts as linear: its values from 0 to 1 become the 16-bit code range, what is brighter is clipped.
+    An EXR counts as linear: its values from 0 to 1, times a gain that the first one sets, become the 16-bit code range;
+    what is brighter is clipped.
     """
 
     def __init__(self, pattern: Path | str) -> None:
@@ -51,12 +52,18 @@ class ImageSequenceReader:
         span = max(self._files) - self._first_number + 1
         check_length(span, str(self.pattern))
         first = self._files[self._first_number]
-        self._reformatter = VideoReformatter()
-        frame = self._read(0, first)
+        self._reformatter, self._gain = VideoReformatter(), 1.0
+        warnings = (f"{span - len(self._files)} numbers are missing in the sequence",) * (span != len(self._files))
+        try:
+            if _is_exr(first):
+                warnings += self._look_at_exr(first)
+            frame = self._read(0, first)
+        except InputError as error:
+            raise InputError(f"the first image is unusable: {error.what}", where=str(first), got=error.got,
+                             expected=error.expected, mend=error.mend) from error
         if frame.fault:
             raise InputError(f"the first image is unusable: {frame.fault}", where=str(first))
         codes = frame.codes()
-        warnings = (f"{span - len(self._files)} numbers are missing in the sequence",) * (span != len(self._files))
         if isinstance(frame, DecodedFrame) and has_alpha(frame.picture):
             warnings += ("the images' alpha channel is ignored",)
         self.info = VideoInfo(
@@ -82,6 +89,14 @@ class ImageSequenceReader:
             if index % step == 0 if wanted is None else index in wanted:
                 yield self._checked(self._read(index, self._files[number]))
 
+    def _look_at_exr(self, first: Path) -> tuple[str, ...]:
+        """Sets the gain of all images; what there is to say about them."""
+        _check_length_of(first)
+        picture = ExrPicture.read(first)
+        warnings = tuple(picture.warnings())
+        self._gain = picture.gain()
+        return warnings
+
     def _checked(self, frame: SourceFrame) -> SourceFrame:
         """The frame, with a fault where its size or its depth is not the first frame's."""
         if frame.fault:
@@ -97,7 +112,7 @@ class ImageSequenceReader:
     def _read(self, index: int, file: Path) -> SourceFrame:
         time_s = round(index / DEFAULT_FPS, 6)
         if _is_exr(file):
-            return _read_linear_exr(index, time_s, file)
+            return self._read_exr(index, time_s, file)
         try:
             picture = _decoded(file)
             check_size(picture.width, picture.height, str(file))
@@ -109,8 +124,22 @@ class ImageSequenceReader:
         return DecodedFrame(index, time_s, fault, picture, self._reformatter, round(picture.rotation / 90) % 4)
 
 
+    def _read_exr(self, index: int, time_s: float, file: Path) -> SourceFrame:
+        try:
+            _check_length_of(file)
+            return ArrayFrame(index, time_s, "", ExrPicture.read(file).codes(self._gain))
+        except InputError as error:
+            return SourceFrame(index, time_s, error.what)
+
+
 def _is_exr(file: Path) -> bool:
     return file.suffix.lower() == ".exr"
+
+
+def _check_length_of(file: Path) -> None:
+    if file.stat().st_size > LARGEST_FILE:
+        raise InputError("the file is too large", where=str(file), got=f"{file.stat().st_size >> 20} MB",
+                         expected=f"{LARGEST_FILE >> 20} MB or less")
 
 
 def _decoded(file: Path) -> av.VideoFrame:
@@ -118,26 +147,11 @@ def _decoded(file: Path) -> av.VideoFrame:
 
     Without a container: that would decode the picture once more, to find out about its format.
     """
-    if file.stat().st_size > LARGEST_FILE:
-        raise InputError("the file is too large", where=str(file))
+    _check_length_of(file)
     data = file.read_bytes()
     context = av.CodecContext.create(next(name for start, name in _DECODERS.items() if data.startswith(start)), "r")
     context.options, context.thread_count = {"max_pixels": str(MAX_PIXELS)}, 1
     return (context.decode(av.Packet(data)) or context.decode(None))[0]
-
-
-def _read_linear_exr(index: int, time_s: float, file: Path) -> SourceFrame:
-    try:
-        check_size(*exr_size(file), str(file))
-        linear = read_exr(file)
-    except InputError as error:
-        return SourceFrame(index, time_s, error.what)
-    if not np.isfinite(linear).all():
-        return SourceFrame(index, time_s, "NaN or infinite values")
-    if linear.ndim == 2:
-        linear = np.repeat(linear[..., None], 3, axis=2)
-    codes = np.rint(linear.clip(0, 1) * 65535).astype(np.uint16)
-    return ArrayFrame(index, time_s, "", np.ascontiguousarray(codes))
 
 
 def _numbered_files(pattern: Path) -> dict[int, Path]:

@@ -13,6 +13,7 @@ import numpy as np
 import OpenEXR
 
 from shared.errors import InputError, LimnError
+from shared.io.exr_header import check_decodable
 
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _ACESCG = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
@@ -115,7 +116,10 @@ def _header(colour_space: str, attributes: dict, latlong: bool) -> dict:
 
 
 def read_exr(path: Path | str) -> np.ndarray:
-    """-> float32 [H, W] or [H, W, 3]. InputError when the file is missing, truncated or not an EXR of that kind."""
+    """-> float32 [H, W] or [H, W, 3], values as stored. InputError when the file is missing, truncated, larger than any
+    picture once decoded, or not an EXR of that kind.
+    """
+    check_decodable(path)
     try:
         with OpenEXR.File(str(path)) as file:
             if not file.parts:
@@ -132,19 +136,6 @@ def read_exr(path: Path | str) -> np.ndarray:
         raise InputError("an EXR of other channels", where=str(path), got=", ".join(sorted(channels)) or "none",
                          expected="R, G, B or one channel")
     return (colour if colour.ndim == 2 else colour[..., :3]).astype(np.float32)
-
-
-def exr_size(path: Path | str) -> tuple[int, int]:
-    """(width, height) as the header states it, without reading a pixel. InputError when it is not an EXR."""
-    try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            window = file.header()["dataWindow"] if file.parts else None
-    except (RuntimeError, ValueError, TypeError, KeyError) as error:
-        raise InputError("not a readable EXR", where=str(path), got=error) from error
-    if window is None:
-        raise InputError("truncated or empty EXR", where=str(path))
-    (x0, y0), (x1, y1) = (np.asarray(corner, np.int64).tolist() for corner in window)
-    return x1 - x0 + 1, y1 - y0 + 1
 
 
 def write_png(path: Path | str, array: np.ndarray) -> None:

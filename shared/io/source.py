@@ -87,14 +87,14 @@ class ArrayFrame(SourceFrame):
         return self.array if size is None else cv2.resize(self.array, size, interpolation=cv2.INTER_AREA)
 
 
-def check_size(width: int, height: int, where: str) -> None:
+def check_size(width: int, height: int, where: str, smallest: int = MIN_SIDE_PX) -> None:
     """InputError for pictures too small to show anything or too large to decode safely."""
     if min(width, height) < 1:
         raise InputError("the picture's size cannot be read", where=where, mend="copy the file again")
-    if min(width, height) < MIN_SIDE_PX:
+    if min(width, height) < smallest:
         raise InputError(
             "the picture is too small", where=where, got=f"{width} x {height} px",
-            expected=f"{MIN_SIDE_PX} px or more each way", mend="use the original file",
+            expected=f"{smallest} px or more each way", mend="use the original file",
         )
     if width * height > MAX_PIXELS:
         raise InputError(

@@ -12,6 +12,7 @@ import OpenEXR
 from bad_inputs.cases import case, write_settings
 from bad_inputs.clips import head
 from shared.color import decode_srgb
+from shared.io.export_maps import acescg_from_rec709
 from shared.io.images import write_png
 
 LINEAR = "colour: {transfer: linear}\n"
@@ -25,9 +26,9 @@ def sequence(folder, suffix, write, more="", count=12):
     write_settings(folder, f"frames/%04d.{suffix}", more)
 
 
-def exr(path, channels):
+def exr(path, channels, **attributes):
     """Any channels, as they are."""
-    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION} | attributes
     with OpenEXR.File(header, {name: np.ascontiguousarray(values) for name, values in channels.items()}) as file:
         file.write(str(path))
 
@@ -90,6 +91,80 @@ def truncated_exr(folder):
 def other_channels(folder):
     depth = np.zeros((144, 144), np.float32)
     sequence(folder, "exr", lambda path, codes, _: exr(path, {"depth.Z": depth, "id": depth}), LINEAR)
+
+
+def box(x0, y0, width, height):
+    """A window."""
+    return np.array([x0, y0], np.int32), np.array([x0 + width - 1, y0 + height - 1], np.int32)
+
+
+@case("a depth map as EXR", "other channels")
+def depth_exr(folder):
+    sequence(folder, "exr", lambda path, codes, _: exr(path, {"Z": linear(codes)[..., 0]}), LINEAR)
+
+
+@case("an EXR of channels that decode to gigabytes", "too large once decoded")
+def exr_of_channels(folder):
+    planes = {f"aov{i:03d}": np.zeros((2000, 2000), np.float16) for i in range(120)}
+    sequence(folder, "exr", lambda path, codes, _: exr(path, {"RGB": np.zeros((2000, 2000, 3), np.float16), **planes}),
+             LINEAR, count=1)
+
+
+@case("an EXR with a large second part", "too large")
+def exr_of_parts(folder):
+    def write(path, codes, number):
+        sizes = (codes.shape[:2], (12_000, 12_000))
+        windows = [{"displayWindow": box(0, 0, *sizes[0]), "dataWindow": box(0, 0, *size[::-1])} for size in sizes]
+        parts = [OpenEXR.Part({"type": OpenEXR.scanlineimage} | window, {"Y": np.zeros(size, np.float16)}, str(i))
+                 for i, (window, size) in enumerate(zip(windows, sizes, strict=True))]
+        with OpenEXR.File(parts) as file:
+            file.write(str(path))
+    sequence(folder, "exr", write, LINEAR, count=1)
+
+
+@case("an EXR with a huge display window", "too large")
+def exr_display_window(folder):
+    window = box(0, 0, 60_000, 60_000)
+    sequence(folder, "exr", lambda path, codes, _: exr(path, {"RGB": linear(codes)}, displayWindow=window), LINEAR)
+
+
+@case("EXR in ACEScg")
+def acescg_exr(folder):
+    primaries = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
+
+    def write(path, codes, number):
+        exr(path, {"RGB": acescg_from_rec709(linear(codes)).astype(np.float32)}, chromaticities=primaries)
+    sequence(folder, "exr", write, LINEAR)
+
+
+@case("EXR with data windows of their own")
+def windowed_exr(folder):
+    def write(path, codes, number):
+        x, y, values = number % 5, number % 3, linear(codes)
+        exr(path, {"RGB": np.ascontiguousarray(values[y:, x:])}, dataWindow=box(x, y, 144 - x, 144 - y),
+            displayWindow=box(0, 0, 144, 144))
+    sequence(folder, "exr", write, LINEAR)
+
+
+@case("EXR a hundred times as bright")
+def bright_exr(folder):
+    sequence(folder, "exr", lambda path, codes, _: exr(path, {"RGB": 100 * linear(codes)}), LINEAR)
+
+
+@case("EXR with oblong pixels", "not square")
+def oblong_exr(folder):
+    sequence(folder, "exr", lambda path, codes, _: exr(path, {"RGB": linear(codes)}, pixelAspectRatio=2.0), LINEAR)
+
+
+@case("EXR below zero", "negative light")
+def negative_exr(folder):
+    sequence(folder, "exr", lambda path, codes, _: exr(path, {"RGB": linear(codes) - 0.5}), LINEAR)
+
+
+@case("an environment map as EXR", "environment map")
+def envmap_exr(folder):
+    write = lambda path, codes, _: exr(path, {"RGB": linear(codes)}, envmap=OpenEXR.ENVMAP_LATLONG)  # noqa: E731
+    sequence(folder, "exr", write, LINEAR)
 
 
 @case("16 bit PNG")
