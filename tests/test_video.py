@@ -37,6 +37,58 @@ def test_the_rotation_flag_is_honoured(tmp_path, rotation):
     assert next(reader.frames()).codes((120, 100)).shape == (100, 120, 3)
 
 
+MATRICES = {
+    "mirrored": ((-1, 0, 0, 1), lambda rgb: rgb[:, ::-1]),
+    "upside down in a mirror": ((1, 0, 0, -1), lambda rgb: rgb[::-1]),
+    "half a turn": ((-1, 0, 0, -1), lambda rgb: rgb[::-1, ::-1]),
+    "clockwise": ((0, 1, -1, 0), lambda rgb: np.rot90(rgb, -1)),
+    "transposed": ((0, 1, 1, 0), lambda rgb: rgb.transpose(1, 0, 2)),
+    "across the other diagonal": ((0, -1, -1, 0), lambda rgb: np.rot90(rgb, 2).transpose(1, 0, 2)),
+}
+
+
+@pytest.mark.parametrize("name", MATRICES)
+def test_the_display_matrix_turns_and_mirrors(tmp_path, name):
+    matrix, show = MATRICES[name]
+    stored = turning_face(2)
+    reader = open_video(write_video(tmp_path / "clip.mp4", stored, display_matrix=matrix))
+    for index, codes in reader:
+        shown = show(stored[index])
+        assert (reader.info.height, reader.info.width) == shown.shape[:2] == codes.shape[:2]
+        assert np.abs(codes.astype(int) - shown).mean() < 4
+    width, height = reader.info.width // 2, reader.info.height // 2
+    assert next(reader.frames()).codes((width, height)).shape == (height, width, 3)
+
+
+@pytest.mark.parametrize("text", ["\u00b2", "\u0663\u0665", "26.", "1e2", "nan", "-26", "26 mm"])
+def test_a_focal_length_that_is_no_number_is_passed_over(tmp_path, text):
+    key = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
+    path = write_video(tmp_path / "clip.mp4", turning_face(2), metadata={key: text})
+    assert probe(path).focal_length_35mm is None
+    assert probe(write_video(tmp_path / "b.mp4", turning_face(2), metadata={key: "26.5"})).focal_length_35mm == 26.5
+
+
+def test_of_two_videos_in_a_file_the_larger_is_taken(tmp_path):
+    path = tmp_path / "clip.mkv"
+    sizes = {"preview": (96, 80), "clip": (240, 200)}
+    with av.open(str(path), "w") as container:
+        streams = []
+        for width, height in sizes.values():
+            stream = container.add_stream("ffv1", rate=25)
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            streams.append(stream)
+        for rgb in turning_face(5):
+            for stream in streams:
+                small = cv2.resize(rgb, (stream.width, stream.height))
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(small, format="rgb24")))
+        for stream in streams:
+            container.mux(stream.encode())
+    reader = open_video(path)
+    assert (reader.info.width, reader.info.height) == (240, 200) and reader.info.frame_count == 5
+    assert all(codes.shape == (200, 240, 3) for _, codes in reader)
+    assert any("2 videos" in text for text in reader.info.warnings)
+
+
 def test_chosen_frames_are_the_same_as_in_a_full_pass(tmp_path):
     reader = open_video(write_video(tmp_path / "clip.mp4", turning_face(20), options={"bf": "3", "crf": "20"}))
     whole = dict(reader)
@@ -199,6 +251,12 @@ BAD = {
     "huge GIF": (bad_gif_bomb, "size|large"),
     "8 px": (lambda folder: write_video(folder / "clip.mp4", [np.zeros((8, 8, 3), np.uint8)] * 3), "too small"),
     "oblong pixels": (lambda folder: write_video(folder / "c.mp4", turning_face(3), aspect=Fraction(4, 3)), "square"),
+    "turned by 45 degrees": (lambda folder: write_video(
+        folder / "c.mp4", turning_face(3), display_matrix=(0.7071, 0.7071, -0.7071, 0.7071)), "no quarter turn"),
+    "stretched when shown": (
+        lambda folder: write_video(folder / "c.mp4", turning_face(3), display_matrix=(2, 0, 0, 1)), "not square"),
+    "shown as nothing": (
+        lambda folder: write_video(folder / "c.mp4", turning_face(3), display_matrix=(1, 0, 1, 0)), "display matrix"),
     "two counters": (bad_counter, "not a pattern"),
     "no image": (lambda folder: folder / "%05d.png", "no image"),
     "no image folder": (lambda folder: folder / "frames" / "%05d.png", "folder"),

@@ -37,10 +37,13 @@ def turning_face(count: int, **options) -> list[np.ndarray]:
 def write_video(path: Path, frames: Sequence[np.ndarray], *, codec: str = "libx264", pixel_format: str = "yuv420p",
                 rate: int = 25, rotation: int | None = None, pts_ms: Sequence[int] | None = None,
                 matrix: int | None = 1, options: dict | None = None, aspect: Fraction | None = None,
-                colour: dict | None = None) -> Path:
-    """Encodes uint8 RGB frames, with very little loss by default."""
+                colour: dict | None = None, display_matrix: Sequence[float] | None = None,
+                metadata: dict | None = None) -> Path:
+    """Encodes uint8 RGB frames, with very little loss by default. display_matrix: a, b, c, d, see orientation.py."""
     quality = {"crf": "8", "preset": "ultrafast"} if codec == "libx264" else {}
-    with av.open(str(path), "w") as container:
+    flags = {"movflags": "use_metadata_tags"} if metadata else {}
+    with av.open(str(path), "w", options=flags) as container:
+        container.metadata.update(metadata or {})
         stream = container.add_stream(codec, rate=rate, options=options or quality)
         stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt = pixel_format
@@ -50,6 +53,9 @@ def write_video(path: Path, frames: Sequence[np.ndarray], *, codec: str = "libx2
             setattr(stream.codec_context, name, value)
         if rotation is not None:
             stream.set_display_rotation(rotation)
+        if display_matrix is not None:
+            a, b, c, d = (round(65536 * value) for value in display_matrix)
+            stream.set_display_matrix([a, b, 0, c, d, 0, 0, 0, 1 << 30])
         for i, rgb in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
             if matrix:

@@ -12,6 +12,7 @@ from av.video.reformatter import VideoReformatter
 
 from shared.errors import InputError
 from shared.io.exr_picture import ExrPicture
+from shared.io.orientation import Orientation
 from shared.io.pixel_format import has_alpha
 from shared.io.source import (
     DEFAULT_FPS,
@@ -121,7 +122,8 @@ class ImageSequenceReader:
         except (av.error.FFmpegError, OSError, StopIteration, IndexError):
             return SourceFrame(index, time_s, "not an image that can be read")
         fault = "damaged in the file" if picture.is_corrupt else ""
-        return DecodedFrame(index, time_s, fault, picture, self._reformatter, round(picture.rotation / 90) % 4)
+        orientation = Orientation(round(picture.rotation / 90) % 4)
+        return DecodedFrame(index, time_s, fault, picture, self._reformatter, orientation)
 
 
     def _read_exr(self, index: int, time_s: float, file: Path) -> SourceFrame:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from shared.errors import InputError
+from shared.io.orientation import Orientation
 from shared.io.pixel_format import rgb_codes
 
 if TYPE_CHECKING:
@@ -26,7 +27,8 @@ MEND_CODEC = "re-encode it: ffmpeg -i IN -pix_fmt yuv420p -c:v libx264 -crf 12 O
 class VideoInfo:
     """Facts that hold for every frame of a source.
 
-    width, height: px as shown, after `rotation` (degrees counter-clockwise that the pictures are turned by).
+    width, height: px as shown, after `rotation` (degrees counter-clockwise that the pictures are turned by; `mirrored`
+    ones are mirrored left to right before).
     frame_count: what the file states or its packets say. bits: per component. transfer_tag: the transfer function
     that the file names ("" for none, which is not the one that the subject states). focal_length_35mm: mm for a
     36 mm wide sensor, where the camera wrote it into the file. warnings: one sentence each.
@@ -38,6 +40,7 @@ class VideoInfo:
     frame_count: int
     codec: str
     rotation: int = 0
+    mirrored: bool = False
     bits: int = 8
     transfer_tag: str = ""
     focal_length_35mm: float | None = None
@@ -59,21 +62,21 @@ class SourceFrame:
 
 @dataclass(frozen=True)
 class DecodedFrame(SourceFrame):
-    """A picture that FFmpeg decoded; quarter_turns: counter-clockwise."""
+    """A picture that FFmpeg decoded, as stored; orientation: how it is shown."""
 
     picture: av.VideoFrame | None = None
     reformatter: VideoReformatter | None = None
-    quarter_turns: int = 0
+    orientation: Orientation = Orientation()
 
     def codes(self, size: tuple[int, int] | None = None) -> np.ndarray:
         """See SourceFrame."""
-        stored_size = size[::-1] if size and self.quarter_turns % 2 else size
+        stored_size = self.orientation.size(*size) if size else None
         try:
             codes = rgb_codes(self.reformatter, self.picture, stored_size)
         except (av.error.FFmpegError, ValueError) as error:
             raise InputError("pixels in a format that cannot be converted", where=f"frame {self.index}",
                              got=self.picture.format.name, mend=MEND_CODEC) from error
-        return np.ascontiguousarray(np.rot90(codes, self.quarter_turns))
+        return self.orientation.apply(codes)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import time
 from collections.abc import Collection, Iterator
 from fractions import Fraction
@@ -22,6 +23,7 @@ from av.video.reformatter import VideoReformatter
 
 from shared.errors import InputError
 from shared.io.image_sequence import ImageSequenceReader, is_sequence
+from shared.io.orientation import Orientation
 from shared.io.pixel_format import UNSPECIFIED_MATRIX, has_alpha
 from shared.io.source import DEFAULT_FPS, MAX_PIXELS, DecodedFrame, SourceFrame, VideoInfo, check_length, check_size
 
@@ -34,6 +36,7 @@ MAX_STALL_CPU_S, MAX_READ_CPU_S = 60.0, 7200.0
 _TRANSFER_TAGS = {1: "bt709", 4: "gamma22", 6: "bt601", 8: "linear", 13: "srgb", 14: "bt2020", 15: "bt2020",
                   16: "pq", 18: "hlg"}
 _MEND_DAMAGED = "copy the file again from the camera, or re-encode it: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4"
+_PLAIN_NUMBER = re.compile(r"[0-9]{1,4}(\.[0-9]{1,9})?")
 _FOCAL_KEYS = ("com.apple.quicktime.camera.focal_length.35mm_equivalent",)
 
 
@@ -60,7 +63,7 @@ class VideoReader:
             first = next(_pictures(container, stream), None)
             if first is None:
                 raise InputError("no frame of the video can be decoded", where=str(self.path), mend=_MEND_DAMAGED)
-            self._quarter_turns = round(first.rotation / 90) % 4
+            self._orientation = Orientation.of_video(first, str(self.path))
             self._stored_size = first.width, first.height
             self._duration_s = _stated_duration(container)
             self.info = self._info(container, stream, first)
@@ -87,7 +90,7 @@ class VideoReader:
                 start = picture.pts if start is None else start
                 time_s = self._time(picture, start, time_s)
                 if count % step == 0 if wanted is None else count in wanted:
-                    yield DecodedFrame(count, time_s, self._fault(picture), picture, reformatter, self._quarter_turns)
+                    yield DecodedFrame(count, time_s, self._fault(picture), picture, reformatter, self._orientation)
                 count += 1
                 check_length(count, str(self.path))
         if wanted is None:
@@ -117,18 +120,19 @@ class VideoReader:
             )
 
     def _info(self, container: av.container.InputContainer, stream: av.VideoStream, first: av.VideoFrame) -> VideoInfo:
-        width, height = (first.height, first.width) if self._quarter_turns % 2 else (first.width, first.height)
+        width, height = self._orientation.size(first.width, first.height)
         return VideoInfo(
             width=width,
             height=height,
             fps=_frame_rate(stream),
             frame_count=_frame_count(stream, self.path),
             codec=stream.codec_context.name,
-            rotation=self._quarter_turns * 90,
+            rotation=self._orientation.quarter_turns * 90,
+            mirrored=self._orientation.mirrored,
             bits=max(component.bits for component in first.format.components),
             transfer_tag=_TRANSFER_TAGS.get(int(stream.codec_context.color_trc or 2), ""),
             focal_length_35mm=_focal_length(container, stream),
-            warnings=tuple(_warnings(stream, first, self.path)),
+            warnings=tuple(_warnings(container, stream, first, self.path)),
         )
 
 
@@ -155,15 +159,21 @@ def _opened(path: Path) -> av.container.InputContainer:
 
 
 def _video_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
-    """The first stream of moving pictures (cover art does not count), set up for safe decoding."""
-    for stream in container.streams.video:
-        if not stream.disposition & av.stream.Disposition.attached_pic and stream.codec_context is not None:
-            stream.thread_type = "AUTO"
-            stream.codec_context.thread_count = min(MAX_THREADS, os.cpu_count() or 1)
-            stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
-            return stream
+    """The largest stream of moving pictures (cover art does not count), the first of equals; for safe decoding."""
+    streams = _moving_pictures(container)
+    if streams:
+        stream = max(streams, key=lambda s: s.codec_context.width * s.codec_context.height)
+        stream.thread_type = "AUTO"
+        stream.codec_context.thread_count = min(MAX_THREADS, os.cpu_count() or 1)
+        stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+        return stream
     kinds = ", ".join(stream.type for stream in container.streams) or "nothing"
     raise InputError("no video stream in the file", where=str(path), got=kinds, mend="point `video` at the clip itself")
+
+
+def _moving_pictures(container: av.container.InputContainer) -> list[av.VideoStream]:
+    return [stream for stream in container.streams.video
+            if not stream.disposition & av.stream.Disposition.attached_pic and stream.codec_context is not None]
 
 
 def _pictures(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.VideoFrame]:
@@ -220,16 +230,19 @@ def _focal_length(container: av.container.InputContainer, stream: av.VideoStream
     """35 mm equivalent focal length that phones write into the file, in mm."""
     for key in _FOCAL_KEYS:
         text = container.metadata.get(key) or stream.metadata.get(key) or ""
-        if text.replace(".", "", 1).isdigit() and 5 <= float(text) <= 500:
+        if _PLAIN_NUMBER.fullmatch(text) and 5 <= float(text) <= 500:
             return float(text)
     return None
 
 
-def _warnings(stream: av.VideoStream, first: av.VideoFrame, path: Path) -> Iterator[str]:
+def _warnings(container: av.container.InputContainer, stream: av.VideoStream, first: av.VideoFrame,
+              path: Path) -> Iterator[str]:
     ratio = stream.sample_aspect_ratio
     if ratio and ratio not in (0, 1):
         raise InputError("the video's pixels are not square", where=str(path), got=f"{ratio}", expected="1:1",
                          mend="ffmpeg -i IN -vf scale=iw*sar:ih,setsar=1 -c:v libx264 -crf 12 OUT.mp4")
+    if (count := len(_moving_pictures(container))) > 1:
+        yield f"the file holds {count} videos: the largest, {first.width} x {first.height} px, is taken"
     if first.interlaced_frame:
         yield "the video is interlaced: film progressive, or de-interlace it first"
     if has_alpha(first) and stream.codec_context.name != "gif":

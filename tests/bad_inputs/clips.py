@@ -176,6 +176,36 @@ def rotation_flag(folder):
     write_video(folder / "clip.mp4", [np.rot90(frame) for frame in head()], rotation=-90)
 
 
+@case("mirrored by its display matrix")
+def mirrored_by_matrix(folder):
+    write_video(folder / "clip.mp4", [frame[::-1] for frame in head()], display_matrix=(1, 0, 0, -1))
+
+
+@case("turned by 45 degrees", "no quarter turn")
+def turned_by_45(folder):
+    write_video(folder / "clip.mp4", head(), display_matrix=(0.7071, 0.7071, -0.7071, 0.7071))
+
+
+@case("a superscript as focal length")
+def superscript_focal_length(folder):
+    key = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
+    write_video(folder / "clip.mp4", head(), metadata={key: "\u00b2"})
+    (folder / "subject.yaml").write_text("video: clip.mp4\n")
+
+
+@case("a preview before the clip")
+def preview_first(folder):
+    with av.open(str(folder / "clip.mkv"), "w") as container:
+        streams = [container.add_stream("ffv1", rate=25) for _ in range(2)]
+        for stream, size in zip(streams, (48, 144), strict=True):
+            stream.width, stream.height, stream.pix_fmt = size, size, "yuv444p"
+        for frame, stream in itertools.product(head(), streams):
+            picture = cv2.resize(frame, (stream.width, stream.height))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        for stream in streams:
+            container.mux(stream.encode())
+
+
 @case("variable frame rate")
 def variable_rate(folder):
     times = np.cumsum([0, *np.tile([20, 35, 80, 41], 3)])[:12].tolist()
