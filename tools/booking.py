@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 
+from shared.contract.limits import EXPECTED_MB, EXPECTED_MINUTES
 from shared.contract.needs import Scale, amount, measured_scale
 
 KINDS = ("mem_mb", "runtime")
@@ -21,6 +22,13 @@ def booked(needs: Mapping[str, Mapping[str, float]], kind: str, scale: Mapping[s
     """
     needed = attempt * amount(needs, kind, measured_scale(run, Scale(**scale))) + overhead
     return needed if limit is None else min(needed, limit)
+
+
+def expected(resources: object) -> str:
+    """What a job has booked, as assignments of a shell; its limits follow, see shared/contract/limits.py."""
+    names = {"mem_mb": EXPECTED_MB, "runtime": EXPECTED_MINUTES}
+    booked_of = {kind: getattr(resources, kind, None) for kind in names}
+    return " ".join(f"{names[kind]}={value}" for kind, value in booked_of.items() if isinstance(value, int))
 
 
 def memory_to_give() -> int:

@@ -67,13 +67,17 @@ class RunFolder:
 
     def temporary(self, name: str) -> Path:
         """A fresh folder beside the stage's, for the process to write into."""
-        path = self.work / f".{name}.tmp-{os.getpid()}"
+        path = self.temporary_of(name, os.getpid())
         try:
             path.mkdir(parents=True)
         except OSError as error:
             raise InputError("cannot write here", where=str(self.work), got=error.strerror,
                              mend="write elsewhere with --out DIR") from error
         return path
+
+    def temporary_of(self, name: str, process: int) -> Path:
+        """Where the process of that number writes."""
+        return self.work / f".{name}.tmp-{process}"
 
     def publish(self, temporary: Path, name: str) -> None:
         """Renames the finished folder into place, in one step with the folder of an earlier run, which is removed then.

@@ -1,8 +1,8 @@
 """Starts a stage for the workflow: `python -m shared.contract.launch FOLDER PACKAGE NAME [stage arguments]`.
 
-Ties the process to its parent, so that a stage never outlives a killed workflow; answers at once where the stage's
-result is current, without loading what the stage needs; else goes on as `python -m PACKAGE.NAME`, with the threads set
-before anything numeric is loaded.
+Ties the process to its parent, so that a stage never outlives a killed workflow, and holds it to its limits; answers
+at once where the stage's result is current, without loading what the stage needs; else goes on as
+`python -m PACKAGE.NAME`, with the threads set before anything numeric is loaded.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pathlib import Path
 
 from shared.contract.cli import answer_current, parse_request, report_input_error
 from shared.contract.interpreter import settle
+from shared.contract.limits import hold_to_limits
 from shared.contract.pipeline import REPOSITORY
 from shared.contract.source import read_declaration
 from shared.errors import InputError
@@ -65,10 +66,11 @@ def main() -> int:
     try:
         if answer_current(request):
             return 0
+        settle(request.threads)  # which may start the interpreter anew: the limits' watcher comes after it
+        hold_to_limits(name, request.run, request.events)
     except InputError as error:
         report_input_error(name, error, request.events)
         return 2
-    settle(request.threads)
     search = [folder, str(REPOSITORY)]
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [*search, os.environ.get("PYTHONPATH", "")]))
     sys.path[:0] = search
