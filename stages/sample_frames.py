@@ -60,7 +60,7 @@ def run(job: Job) -> None:
 
     use_baseline_opencv()
     subject, params = job.subject, job.params
-    reader, networks = open_video(subject.video), load_face_networks()
+    reader, networks = open_video(subject.video, subject.transfer), load_face_networks()
     info = reader.info
     chart = watch_for_chart(reader, job.subject)
     candidates = params.frame_count * params.candidates
@@ -95,8 +95,6 @@ def run(job: Job) -> None:
 
 def transfer_warnings(tag: str, transfer: str) -> list[str]:
     """What does not fit between the transfer function that the file names and the one that the subject states."""
-    if tag in ("pq", "hlg"):
-        return [f"the video is tagged as HDR ({tag}) but read as {transfer}: colours and light will be off"]
     if tag == "linear" and transfer != "linear":
         return [f"the images are linear but read as {transfer}: set colour.transfer to linear"]
     return []

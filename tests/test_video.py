@@ -106,14 +106,6 @@ def test_ten_bit_video_keeps_its_depth(tmp_path):
     assert np.abs(codes / 257.0 - turning_face(1)[0]).mean() < 0.5
 
 
-def test_hdr_and_wide_gamut_tags_are_reported(tmp_path):
-    path = write_video(tmp_path / "clip.mkv", turning_face(2), codec="ffv1", pixel_format="yuv444p10le", matrix=9,
-                       colour={"color_trc": 18, "color_primaries": 9})
-    info = probe(path)
-    assert info.transfer_tag == "hlg"
-    assert any("BT.2020" in text for text in info.warnings)
-
-
 def test_gif(tmp_path):
     frames = turning_face(5)
     with av.open(str(tmp_path / "clip.gif"), "w") as container:

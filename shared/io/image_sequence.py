@@ -11,6 +11,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 
 from shared.errors import InputError
+from shared.io.colour_tags import conversion_of
 from shared.io.exr_picture import ExrPicture
 from shared.io.orientation import Orientation
 from shared.io.pixel_format import has_alpha
@@ -45,7 +46,7 @@ class ImageSequenceReader:
     what is brighter is clipped.
     """
 
-    def __init__(self, pattern: Path | str) -> None:
+    def __init__(self, pattern: Path | str, transfer: str = "srgb") -> None:
         """Lists the files and reads the first. InputError where there is none or it cannot be read."""
         self.pattern = Path(pattern)
         self._files = _numbered_files(self.pattern)
@@ -53,7 +54,7 @@ class ImageSequenceReader:
         span = max(self._files) - self._first_number + 1
         check_length(span, str(self.pattern))
         first = self._files[self._first_number]
-        self._reformatter, self._gain = VideoReformatter(), 1.0
+        self._reformatter, self._transfer, self._gain = VideoReformatter(), transfer, 1.0
         warnings = (f"{span - len(self._files)} numbers are missing in the sequence",) * (span != len(self._files))
         try:
             if _is_exr(first):
@@ -65,8 +66,9 @@ class ImageSequenceReader:
         if frame.fault:
             raise InputError(f"the first image is unusable: {frame.fault}", where=str(first))
         codes = frame.codes()
-        if isinstance(frame, DecodedFrame) and has_alpha(frame.picture):
-            warnings += ("the images' alpha channel is ignored",)
+        if isinstance(frame, DecodedFrame):
+            warnings += ("the images' alpha channel is ignored",) * has_alpha(frame.picture)
+            warnings += tuple(frame.conversion.warnings()) if frame.conversion else ()
         self.info = VideoInfo(
             width=codes.shape[1],
             height=codes.shape[0],
@@ -117,13 +119,14 @@ class ImageSequenceReader:
         try:
             picture = _decoded(file)
             check_size(picture.width, picture.height, str(file))
+            conversion = conversion_of(picture, self._transfer, str(file))
         except InputError as error:
             return SourceFrame(index, time_s, error.what)
         except (av.error.FFmpegError, OSError, StopIteration, IndexError):
             return SourceFrame(index, time_s, "not an image that can be read")
         fault = "damaged in the file" if picture.is_corrupt else ""
         orientation = Orientation(round(picture.rotation / 90) % 4)
-        return DecodedFrame(index, time_s, fault, picture, self._reformatter, orientation)
+        return DecodedFrame(index, time_s, fault, picture, self._reformatter, orientation, conversion)
 
 
     def _read_exr(self, index: int, time_s: float, file: Path) -> SourceFrame:

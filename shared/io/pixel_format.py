@@ -51,7 +51,8 @@ def rgb_codes(reformatter: VideoReformatter, picture: av.VideoFrame, size: tuple
         src_color_range=picture.color_range or ColorRange.UNSPECIFIED,
     ).to_ndarray()
     if is_deep(picture) and _is_yuv(picture):
-        return np.minimum(np.rint(converted * (65535 / _white_of_deep_yuv(picture))), 65535).astype(np.uint16)
+        table = np.minimum(np.rint(np.arange(65536) * (65535 / _white_of_deep_yuv(picture))), 65535).astype(np.uint16)
+        return table[converted]
     return np.ascontiguousarray(converted)
 
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from shared.errors import InputError
+from shared.io.colour_tags import Conversion
 from shared.io.orientation import Orientation
 from shared.io.pixel_format import rgb_codes
 
@@ -62,11 +63,12 @@ class SourceFrame:
 
 @dataclass(frozen=True)
 class DecodedFrame(SourceFrame):
-    """A picture that FFmpeg decoded, as stored; orientation: how it is shown."""
+    """A picture that FFmpeg decoded, as stored; orientation: how it is shown; conversion: of its colours."""
 
     picture: av.VideoFrame | None = None
     reformatter: VideoReformatter | None = None
     orientation: Orientation = Orientation()
+    conversion: Conversion | None = None
 
     def codes(self, size: tuple[int, int] | None = None) -> np.ndarray:
         """See SourceFrame."""
@@ -76,7 +78,7 @@ class DecodedFrame(SourceFrame):
         except (av.error.FFmpegError, ValueError) as error:
             raise InputError("pixels in a format that cannot be converted", where=f"frame {self.index}",
                              got=self.picture.format.name, mend=MEND_CODEC) from error
-        return self.orientation.apply(codes)
+        return self.orientation.apply(codes if self.conversion is None else self.conversion.apply(codes))
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 
 from shared.errors import InputError
+from shared.io.colour_tags import conversion_of
 from shared.io.image_sequence import ImageSequenceReader, is_sequence
 from shared.io.orientation import Orientation
 from shared.io.pixel_format import UNSPECIFIED_MATRIX, has_alpha
@@ -45,15 +46,18 @@ def probe(path: Path | str) -> VideoInfo:
     return open_video(path).info
 
 
-def open_video(path: Path | str) -> VideoReader | ImageSequenceReader:
-    """Reader for a video file, or for an image sequence where the name has a counter (`frames/%05d.png`)."""
-    return ImageSequenceReader(path) if is_sequence(path) else VideoReader(path)
+def open_video(path: Path | str, transfer: str = "srgb") -> VideoReader | ImageSequenceReader:
+    """Reader for a video file, or for an image sequence where the name has a counter (`frames/%05d.png`).
+
+    transfer: the function that codes of Rec.709 primaries stand for, to which tagged colours are converted.
+    """
+    return ImageSequenceReader(path, transfer) if is_sequence(path) else VideoReader(path, transfer)
 
 
 class VideoReader:
     """Streams one video file: memory does not grow with its length. Iterating gives (frame_index, RGB codes)."""
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, transfer: str = "srgb") -> None:
         """Reads the header and decodes the first frame. InputError for whatever cannot be read."""
         self.path = Path(path)
         _check_file(self.path)
@@ -64,6 +68,7 @@ class VideoReader:
             if first is None:
                 raise InputError("no frame of the video can be decoded", where=str(self.path), mend=_MEND_DAMAGED)
             self._orientation = Orientation.of_video(first, str(self.path))
+            self._conversion = conversion_of(first, transfer, str(self.path))
             self._stored_size = first.width, first.height
             self._duration_s = _stated_duration(container)
             self.info = self._info(container, stream, first)
@@ -90,7 +95,8 @@ class VideoReader:
                 start = picture.pts if start is None else start
                 time_s = self._time(picture, start, time_s)
                 if count % step == 0 if wanted is None else count in wanted:
-                    yield DecodedFrame(count, time_s, self._fault(picture), picture, reformatter, self._orientation)
+                    yield DecodedFrame(count, time_s, self._fault(picture), picture, reformatter, self._orientation,
+                                       self._conversion)
                 count += 1
                 check_length(count, str(self.path))
         if wanted is None:
@@ -132,7 +138,8 @@ class VideoReader:
             bits=max(component.bits for component in first.format.components),
             transfer_tag=_TRANSFER_TAGS.get(int(stream.codec_context.color_trc or 2), ""),
             focal_length_35mm=_focal_length(container, stream),
-            warnings=tuple(_warnings(container, stream, first, self.path)),
+            warnings=(*_warnings(container, stream, first, self.path),
+                      *(self._conversion.warnings() if self._conversion else ())),
         )
 
 
@@ -249,5 +256,3 @@ def _warnings(container: av.container.InputContainer, stream: av.VideoStream, fi
         yield "the video's alpha channel is ignored"
     if first.colorspace == UNSPECIFIED_MATRIX and not first.format.is_rgb and len(first.format.components) >= 3:
         yield "the video does not say its colour matrix: BT.709 assumed from 1280 x 577 px on, BT.601 below"
-    if stream.codec_context.color_primaries == 9:
-        yield "the video is tagged BT.2020 (wide gamut): its colours are read as Rec.709"

@@ -8,6 +8,10 @@ from __future__ import annotations
 import re
 
 _ADVICE = (
+    (r"are converted|values do not lie|data window",
+     "Nothing to do if the contact sheet looks right; else correct what the files say of their colours and windows."),
+    (r"negative values", "Nothing to do if they are noise; else export without grading."),
+    (r"holds \d+ videos", "Look at the contact sheet; if it shows the wrong one, cut the other out of the file."),
     (r"capture\.moves",
      "Correct capture.moves in subject.yaml and run again; if both moved, film again with one of them still: light "
      "solved under the wrong one turns along with the head."),
@@ -46,7 +50,6 @@ _ADVICE = (
      "Look at the error maps: large even areas mean that the light changed or moved along, edges that the shape is "
      "off. Film again if the face itself is red or blue."),
     (r"no colour", "Give the original in colour: only brightness can be solved from this one."),
-    (r"HDR|BT.2020", "Convert the clip to Rec.709 first, or to linear EXR images with colour: transfer: linear."),
     (r"are linear|transfer", "Set colour: transfer in subject.yaml to what the camera wrote."),
     (r"colour matrix", "Nothing to do if skin looks right here; else convert the clip with its matrix stated."),
     (r"interlaced", "Film progressive, or de-interlace first: ffmpeg -i IN -vf bwdif -c:v libx264 -crf 12 OUT.mp4."),

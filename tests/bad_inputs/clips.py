@@ -222,6 +222,16 @@ def hdr(folder):
     write_video(folder / "clip.mp4", head(), colour={"color_trc": 16, "color_primaries": 9})
 
 
+@case("Display P3")
+def display_p3(folder):
+    write_video(folder / "clip.mp4", head(), colour={"color_trc": 1, "color_primaries": 12})
+
+
+@case("a logarithmic transfer tag", "not converted")
+def logarithmic(folder):
+    write_video(folder / "clip.mkv", head(), codec="ffv1", pixel_format="yuv444p", colour={"color_trc": 9})
+
+
 @case("alpha")
 def alpha(folder):
     write_video(folder / "clip.mkv", head(), codec="ffv1", pixel_format="yuva420p", matrix=None)
