@@ -70,6 +70,25 @@ def test_a_cut_header_is_an_error_at_every_length(tmp_path):
             read_parts(tmp_path / "cut.exr")
 
 
+def test_spoilt_headers_end_in_one_line_or_a_picture(tmp_path):
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize = tiles.ySize = 64
+    data = write(tmp_path / "a.exr", chromaticities=AP1, type=OpenEXR.tiledimage, tiles=tiles).read_bytes()
+    rng, spoilt = np.random.default_rng(0), tmp_path / "f.0.exr"
+    for name in (b"float", b"box2i", b"tiledesc", b"chlist", b"string"):
+        spoilt.write_bytes(data.replace(name, bytes(reversed(name)), 1))
+        with pytest.raises(InputError, match="EXR"):
+            open_video(tmp_path / "f.%d.exr")
+    for _ in range(400):
+        codes = np.frombuffer(data, np.uint8).copy()
+        codes[rng.integers(4, 500, 3)] = rng.integers(0, 256, 3)
+        spoilt.write_bytes(codes.tobytes())
+        try:
+            open_video(tmp_path / "f.%d.exr")
+        except InputError as error:
+            assert "\n" not in str(error)
+
+
 def many_channels(folder):
     plane = np.zeros((2000, 2000), np.float16)
     names = {f"aov{i:03d}": plane for i in range(70)}

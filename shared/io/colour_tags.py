@@ -17,7 +17,7 @@ import numpy as np
 from shared.color import decode_hlg, decode_pq, decode_transfer, encode_transfer, rec709_from_primaries
 from shared.errors import InputError
 
-UNSPECIFIED = 2
+UNSPECIFIED, LINEAR = 2, 8
 _D65, _C = (0.3127, 0.3290), (0.310, 0.316)
 _BT2020 = 9
 PRIMARIES = {
@@ -67,13 +67,17 @@ class Conversion:
         return hdr + [f"the colours are {name}: they are converted to Rec.709"] * bool(name)
 
 
-def conversion_of(picture: av.VideoFrame, transfer: str, where: str) -> Conversion | None:
-    """None where the codes are what the subject says. InputError for tags that say: no light of a camera."""
+def conversion_of(picture: av.VideoFrame, transfer: str, where: str, profile: int = 1) -> Conversion | None:
+    """None where the codes are what the subject says. InputError for tags that say: no light of a camera.
+
+    profile: primaries of an ICC profile, which count where the picture's own tags are silent.
+    """
     primaries, curve = int(picture.color_primaries), int(picture.color_trc)
     if curve in _NO_LIGHT or primaries == _XYZ:
         raise InputError("the pictures' colours are tagged as what is not converted", where=where,
                          got=_NO_LIGHT.get(curve, "CIE XYZ"), mend=_MEND)
     hdr = HDR.get(curve, "")
+    primaries = profile if profile != 1 and primaries == UNSPECIFIED else primaries
     if hdr and primaries == UNSPECIFIED:
         primaries = _BT2020  # as players do: no other primaries are in use with these curves
     if not hdr and primaries not in PRIMARIES:

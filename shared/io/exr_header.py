@@ -24,6 +24,9 @@ _MAGIC = b"\x76\x2f\x31\x01"
 _DEEP, _MULTIPART = 0x800, 0x1000
 _SAMPLE_BYTES = {0: 4, 1: 2, 2: 4}
 _NUMBERS = {"float": "<f", "chromaticities": "<8f", "box2i": "<4i", "int": "<i"}
+_TYPES = {"dataWindow": "box2i", "displayWindow": "box2i", "pixelAspectRatio": "float", "tiles": "tiledesc",
+          "chromaticities": "chromaticities", "envmap": "envmap", "type": "string", "colorInteropID": "string",
+          "channels": "chlist"}
 _KEEP_CHANNELS = "oiiotool IN.exr --ch R,G,B -o OUT.exr"
 
 
@@ -131,6 +134,8 @@ def _word(data: bytes, at: int) -> tuple[str, int]:
 def _part(attributes: dict[str, tuple[str, bytes]], deep: bool, where: str) -> Part:
     values: dict[str, object] = {}
     for name, (kind, raw) in attributes.items():
+        if _TYPES.get(name, kind) != kind:
+            raise ValueError(f"{name} is of another type")
         if kind in _NUMBERS:
             numbers = struct.unpack(_NUMBERS[kind], raw)
             values[name] = numbers if len(numbers) > 1 else numbers[0]

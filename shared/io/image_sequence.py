@@ -11,8 +11,9 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 
 from shared.errors import InputError
-from shared.io.colour_tags import conversion_of
+from shared.io.colour_tags import LINEAR, conversion_of
 from shared.io.exr_picture import ExrPicture
+from shared.io.image_tags import read_tags
 from shared.io.orientation import Orientation
 from shared.io.pixel_format import has_alpha
 from shared.io.source import (
@@ -59,7 +60,7 @@ class ImageSequenceReader:
         try:
             if _is_exr(first):
                 warnings += self._look_at_exr(first)
-            frame = self._read(0, first)
+            frame = self._opened(0, first)
         except InputError as error:
             raise InputError(f"the first image is unusable: {error.what}", where=str(first), got=error.got,
                              expected=error.expected, mend=error.mend) from error
@@ -76,7 +77,7 @@ class ImageSequenceReader:
             frame_count=span,
             codec=first.suffix[1:].lower(),
             bits=codes.dtype.itemsize * 8,
-            transfer_tag="linear" if _is_exr(first) else "",
+            transfer_tag="linear" if _is_exr(first) or _is_linear(frame) else "",
             warnings=warnings,
         )
 
@@ -113,28 +114,37 @@ class ImageSequenceReader:
         return ArrayFrame(frame.index, frame.time_s, fault, codes)
 
     def _read(self, index: int, file: Path) -> SourceFrame:
-        time_s = round(index / DEFAULT_FPS, 6)
+        """The frame, with a fault where it cannot be used."""
+        try:
+            return self._opened(index, file)
+        except InputError as error:
+            return SourceFrame(index, _time(index), error.what)
+
+    def _opened(self, index: int, file: Path) -> SourceFrame:
+        """InputError where the file cannot be used."""
+        _check_length_of(file)
         if _is_exr(file):
-            return self._read_exr(index, time_s, file)
+            return ArrayFrame(index, _time(index), "", ExrPicture.read(file).codes(self._gain))
         try:
-            picture = _decoded(file)
-            check_size(picture.width, picture.height, str(file))
-            conversion = conversion_of(picture, self._transfer, str(file))
-        except InputError as error:
-            return SourceFrame(index, time_s, error.what)
-        except (av.error.FFmpegError, OSError, StopIteration, IndexError):
-            return SourceFrame(index, time_s, "not an image that can be read")
+            data = file.read_bytes()
+            picture = _decoded(data, str(file))
+        except (av.error.FFmpegError, OSError, StopIteration, IndexError) as error:
+            raise InputError("not an image that can be read", where=str(file)) from error
+        check_size(picture.width, picture.height, str(file))
+        tags = read_tags(data)
+        conversion = conversion_of(picture, self._transfer, str(file), tags.primaries(self._transfer, str(file)))
         fault = "damaged in the file" if picture.is_corrupt else ""
-        orientation = Orientation(round(picture.rotation / 90) % 4)
-        return DecodedFrame(index, time_s, fault, picture, self._reformatter, orientation, conversion)
+        orientation = Orientation.from_exif(tags.orientation)
+        return DecodedFrame(index, _time(index), fault, picture, self._reformatter, orientation, conversion)
 
 
-    def _read_exr(self, index: int, time_s: float, file: Path) -> SourceFrame:
-        try:
-            _check_length_of(file)
-            return ArrayFrame(index, time_s, "", ExrPicture.read(file).codes(self._gain))
-        except InputError as error:
-            return SourceFrame(index, time_s, error.what)
+def _time(index: int) -> float:
+    return round(index / DEFAULT_FPS, 6)
+
+
+def _is_linear(frame: SourceFrame) -> bool:
+    """Whether a PNG's gamma says so."""
+    return isinstance(frame, DecodedFrame) and int(frame.picture.color_trc) == LINEAR
 
 
 def _is_exr(file: Path) -> bool:
@@ -147,16 +157,18 @@ def _check_length_of(file: Path) -> None:
                          expected=f"{LARGEST_FILE >> 20} MB or less")
 
 
-def _decoded(file: Path) -> av.VideoFrame:
+def _decoded(data: bytes, where: str) -> av.VideoFrame:
     """The picture of a file, by its first bytes; StopIteration where they are none of _DECODERS.
 
     Without a container: that would decode the picture once more, to find out about its format.
     """
-    _check_length_of(file)
-    data = file.read_bytes()
     context = av.CodecContext.create(next(name for start, name in _DECODERS.items() if data.startswith(start)), "r")
     context.options, context.thread_count = {"max_pixels": str(MAX_PIXELS)}, 1
-    return (context.decode(av.Packet(data)) or context.decode(None))[0]
+    picture = (context.decode(av.Packet(data)) or context.decode(None))[0]
+    if context.sample_aspect_ratio not in (None, 0, 1):
+        raise InputError("the image's pixels are not square", where=where, got=f"{context.sample_aspect_ratio}",
+                         expected="1:1", mend="scale the images to square pixels, or correct their density")
+    return picture
 
 
 def _numbered_files(pattern: Path) -> dict[int, Path]:

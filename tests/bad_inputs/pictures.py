@@ -191,6 +191,43 @@ def png_bomb(folder):
     sequence(folder, "png", write, count=3)
 
 
+@case("mirrored JPEG with orientation")
+def mirrored_jpeg(folder):
+    note = b"Exif\0\0II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x112, 3, 1, 7, 0, 0)  # across the other diagonal
+
+    def write(path, codes, number):
+        stored = np.ascontiguousarray(np.rot90(codes, 2).transpose(1, 0, 2)[..., ::-1])
+        data = cv2.imencode(".jpg", stored)[1].tobytes()
+        path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(note) + 2) + note + data[2:])
+    sequence(folder, "jpg", write)
+
+
+def noted_png(*notes):
+    """Writes PNGs with these chunks after their head."""
+    def write(path, codes, number):
+        write_png(path, codes)
+        data = path.read_bytes()
+        chunks = b"".join(struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+                          for kind, body in notes)
+        path.write_bytes(data[:33] + chunks + data[33:])
+    return write
+
+
+@case("PNG with a damaged ICC profile", "ICC profile")
+def damaged_profile(folder):
+    sequence(folder, "png", noted_png((b"iCCP", b"x\0\0" + zlib.compress(b"nothing" * 40))))
+
+
+@case("PNG with oblong pixels", "not square")
+def oblong_png(folder):
+    sequence(folder, "png", noted_png((b"pHYs", struct.pack(">IIB", 2000, 1000, 0))))
+
+
+@case("PNG in BT.2020 HLG by its cICP")
+def cicp_png(folder):
+    sequence(folder, "png", noted_png((b"cICP", bytes([9, 18, 0, 1]))))
+
+
 @case("a gap in the numbers")
 def gap(folder):
     sequence(folder, "png", lambda path, codes, number: write_png(path.with_name(f"{5 * number:04d}.png"), codes))
