@@ -12,8 +12,10 @@ import pytest
 from shared.errors import InputError
 from shared.io.export_maps import acescg_from_rec709
 from shared.io.exr_header import read_parts
+from shared.io.exr_picture import read_rec709
 from shared.io.images import read_exr, write_exr
 from shared.io.video import open_video
+from tools.relight_inputs import read_light
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PICTURE = np.random.default_rng(0).uniform(0.02, 0.9, (40, 60, 3)).astype(np.float32)
@@ -259,3 +261,14 @@ def test_what_cannot_be_followed_is_one_line(tmp_path, name):
 def test_own_files_are_bounded_too(tmp_path):
     with pytest.raises(InputError, match="too large"):
         read_exr(large_second_part(tmp_path))
+
+
+def test_a_light_in_other_primaries_is_converted(tmp_path):
+    light = np.random.default_rng(2).uniform(0.1, 5, (16, 32, 3)).astype(np.float32)
+    write_exr(tmp_path / "rec709.exr", light, colour_space="lin_rec709_scene")
+    write_exr(tmp_path / "ap1.exr", acescg_from_rec709(light), colour_space="lin_ap1_scene")
+    write_exr(tmp_path / "grey.exr", light[..., 0], colour_space="data")
+    assert np.array_equal(read_rec709(tmp_path / "rec709.exr"), light)
+    assert np.abs(read_rec709(tmp_path / "ap1.exr") - light).max() < 1e-3
+    assert np.array_equal(read_rec709(tmp_path / "grey.exr"), light[..., 0])
+    assert np.abs(read_light(str(tmp_path / "ap1.exr"), None) - light).max() < 1e-3

@@ -11,7 +11,7 @@ import OpenImageIO
 from shared.errors import InputError
 from shared.geometry import WORLD_FROM_CAMERA, rotation_from_vector
 from shared.io.arrays import load_arrays, read_json
-from shared.io.images import read_exr
+from shared.io.exr_picture import read_rec709
 from shared.io.meshes import load_mesh, read_obj
 from shared.mesh import Mesh, midpoint_subdivision
 from shared.studio_lights import STUDIO_LIGHTS, studio_light
@@ -75,7 +75,7 @@ def _open_result(path: Path) -> Asset:
     return Asset(
         mesh,
         {name: _read_map(folder / "maps", name) for name in MAPS},
-        read_exr(folder / "envmap.exr"),
+        read_rec709(folder / "envmap.exr"),
         arrays["camera_from_head"].astype(np.float64),
         arrays["frame_index"],
         arrays["intrinsics"].astype(np.float64),
@@ -88,7 +88,7 @@ def _read_map(folder: Path, name: str) -> np.ndarray:
     path = next((p for p in (folder / f"{name}.exr", folder / f"{name}.1001.exr") if p.is_file()), None)
     if path is None:
         raise InputError("a map is missing", where=str(folder / f"{name}.exr"))
-    return read_exr(path)
+    return read_rec709(path)
 
 
 def _moves(folder: Path) -> str:
@@ -145,7 +145,7 @@ def read_light(name: str, asset: Asset) -> np.ndarray:
     if path.suffix.lower() not in (".hdr", ".exr") or not path.is_file():
         known = ", ".join([OWN_LIGHT, *STUDIO_LIGHTS])
         raise InputError("no such light", where="--light", got=name, expected=f"a .hdr or .exr file, or one of {known}")
-    image = read_exr(path) if path.suffix.lower() == ".exr" else _read_hdr(path)
+    image = read_rec709(path) if path.suffix.lower() == ".exr" else _read_hdr(path)
     image = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
     height, width = image.shape[:2]
     if width != 2 * height or height < 2 or height > _LARGEST_LIGHT:

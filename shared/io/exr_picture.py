@@ -18,6 +18,7 @@ import OpenEXR
 from shared.color import rec709_from_primaries
 from shared.errors import InputError
 from shared.io.exr_header import Part, check_decodable
+from shared.io.images import read_exr
 from shared.io.source import check_size
 
 LARGEST_CODE = 65535
@@ -137,11 +138,22 @@ class ExrPicture:
         return self._rows(slice(top, bottom, step), slice(left, right, step))
 
 
+def read_rec709(path: Path | str) -> np.ndarray:
+    """-> float32 [H, W] or [H, W, 3] in linear Rec.709, as stored otherwise: for maps and lights of any scale.
+
+    InputError where the file cannot be read or its primaries span nothing.
+    """
+    image, matrix = read_exr(path), _matrix(check_decodable(path), str(path))
+    return image if matrix is None or image.ndim == 2 else image @ matrix.T.astype(np.float32)
+
+
 def _check_attributes(part: Part, where: str) -> None:
     ratio = part.values.get("pixelAspectRatio", 1.0)
     if not abs(ratio - 1) < 1e-3:
+        (width, height), known = part.size, 0.1 < ratio < 10
+        size = f" --resize {round(width * ratio)}x{height} --attrib PixelAspectRatio 1" if known else ""
         raise InputError("the EXR's pixels are not square", where=where, got=f"pixelAspectRatio {ratio:g}",
-                         expected="1", mend="scale the images to square pixels: oiiotool IN.exr --resize ...")
+                         expected="1", mend=f"scale the images to square pixels: oiiotool IN.exr{size} -o OUT.exr")
     if "envmap" in part.values:
         raise InputError("the EXR is an environment map", where=where, expected="a picture of a camera")
     space = str(part.values.get("colorInteropID", ""))
