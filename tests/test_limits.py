@@ -1,9 +1,12 @@
 """A stage that takes far more memory or time than expected is ended with one line; all others go on."""
 
+import os
+
 import pytest
 from toy_runs import copy_pipeline, limn, make_subject, tree
 
-from shared.contract.limits import EXPECTED_MB, EXPECTED_MINUTES, FACTOR, LEAST_MB, Limits
+from shared.contract.folders import RunFolder
+from shared.contract.limits import EXPECTED_MB, EXPECTED_MINUTES, FACTOR, LEAST_MB, Limits, hold_to_limits
 from shared.errors import InputError
 
 BY_DECODER = "import ctypes; hog = bytearray(b'x' * 500_000_000); ctypes.PyDLL(None).sleep(60)"
@@ -58,6 +61,13 @@ def test_without_limits_it_goes_on(tmp_path):
     arguments = ("--pipeline", pipeline, "--trust", pipeline.parent, "--out", tmp_path / "out")
     exit_code, output = limn("run", subject, *arguments, **{FACTOR: "0"})
     assert exit_code == 0, output
+
+
+def test_where_no_process_can_watch_the_stage_goes_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv(EXPECTED_MB, "1500")
+    monkeypatch.setattr(os, "pidfd_open", lambda _: (_ for _ in ()).throw(PermissionError("forbidden")))
+    hold_to_limits("read_text", RunFolder(tmp_path), None)
+    assert "not held" in capsys.readouterr().err
 
 
 def test_limits_follow_what_is_expected(monkeypatch):

@@ -86,12 +86,15 @@ def hold_to_limits(name: str, run: RunFolder, events: Path | None) -> None:
 
     The watcher is no child of this process, whose memory and waiting it would be part of, and ends with it.
     """
-    limits = Limits.from_environment()
-    if not limits or not hasattr(os, "pidfd_open"):  # Linux alone has it
+    limits, stage = Limits.from_environment(), os.getpid()
+    if not limits:
         return
-    stage = os.getpid()
-    handle = os.pidfd_open(stage)
-    between = os.fork()
+    try:
+        handle = os.pidfd_open(stage)
+        between = os.fork()
+    except (AttributeError, OSError) as error:  # no Linux, or a container that forbids it
+        sys.stderr.write(f"{name}: not held to its limits of memory and minutes: {error}\n")
+        return
     if between == 0:
         if os.fork() == 0:
             try:
