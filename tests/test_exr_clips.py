@@ -258,7 +258,9 @@ def test_what_cannot_be_followed_is_one_line(tmp_path, name):
     assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
 
 
-def test_own_files_are_bounded_too(tmp_path):
+def test_own_files_and_lights_are_bounded_too(tmp_path):
+    light = write(tmp_path / "light.exr", {"Y": np.zeros((4096, 8192), np.float16)})
+    assert read_exr(light).shape == (4096, 8192)  # larger than any frame of a clip may be
     with pytest.raises(InputError, match="too large"):
         read_exr(large_second_part(tmp_path))
 

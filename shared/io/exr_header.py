@@ -18,8 +18,8 @@ from shared.io.source import MAX_PIXELS, check_size
 
 MOST_HEADER_BYTES = 4_000_000
 MOST_PARTS, MOST_CHANNELS = 32, 128
-MOST_BYTES = 16 * MAX_PIXELS
-"""Of all parts together once they are decoded: the largest picture in four channels of 32 bits."""
+PIXEL_BYTES = 16
+"""Of all parts together once they are decoded, for each pixel of the largest picture: four channels of 32 bits."""
 _MAGIC = b"\x76\x2f\x31\x01"
 _DEEP, _MULTIPART = 0x800, 0x1000
 _SAMPLE_BYTES = {0: 4, 1: 2, 2: 4}
@@ -78,20 +78,20 @@ def read_parts(path: Path | str) -> list[Part]:
         raise InputError("truncated EXR, or damaged in its header", where=str(path)) from error
 
 
-def check_decodable(path: Path | str) -> Part:
+def check_decodable(path: Path | str, most_pixels: int = MAX_PIXELS) -> Part:
     """The first part, after all parts are found small enough to be decoded. InputError otherwise."""
     parts, where = read_parts(path), str(path)
     for part in parts:
         if part.deep:
             raise InputError("a deep EXR", where=where, expected="one sample a pixel",
                              mend="flatten it: oiiotool IN.exr --flatten -o OUT.exr")
-        check_size(*part.size, where, smallest=1)
+        check_size(*part.size, where, smallest=1, largest=most_pixels)
         if any(edge > 4096 for edge in part.values.get("tiles", (1, 1))):
             raise InputError("the tiles of the EXR are too large", where=where, got=part.values["tiles"],
                              expected="4096 px or less each way", mend="oiiotool IN.exr --scanline -o OUT.exr")
-    needed = sum(part.bytes() for part in parts)
-    if needed > MOST_BYTES:
-        raise InputError("the EXR is too large once decoded", where=where, expected=f"{MOST_BYTES >> 20} MB or less",
+    needed, most = sum(part.bytes() for part in parts), PIXEL_BYTES * most_pixels
+    if needed > most:
+        raise InputError("the EXR is too large once decoded", where=where, expected=f"{most >> 20} MB or less",
                          got=f"{sum(len(part.channels) for part in parts)} channels in {len(parts)} parts, "
                              f"{needed >> 20} MB", mend=f"keep the colour only: {_KEEP_CHANNELS}")
     return parts[0]

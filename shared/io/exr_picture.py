@@ -17,7 +17,7 @@ import OpenEXR
 
 from shared.color import rec709_from_primaries
 from shared.errors import InputError
-from shared.io.exr_header import Part, check_decodable
+from shared.io.exr_header import Part, check_decodable, read_parts
 from shared.io.images import read_exr
 from shared.io.source import check_size
 
@@ -143,7 +143,7 @@ def read_rec709(path: Path | str) -> np.ndarray:
 
     InputError where the file cannot be read or its primaries span nothing.
     """
-    image, matrix = read_exr(path), _matrix(check_decodable(path), str(path))
+    image, matrix = read_exr(path), _matrix(read_parts(path)[0], str(path))
     return image if matrix is None or image.ndim == 2 else image @ matrix.T.astype(np.float32)
 
 

@@ -22,6 +22,8 @@ COLOUR_SPACES = (*_CHROMATICITIES, "data")
 HALF_MAXIMUM = 65504.0
 LAYOUTS = ("scanline", "tiled", "mipmap")
 TILE = 64
+LARGEST_MAP = 16384 * 8192
+"""Pixels of a map or a lat-long light."""
 _NO_DATE = "1980:01:01 00:00:00"
 
 
@@ -119,7 +121,7 @@ def read_exr(path: Path | str) -> np.ndarray:
     """-> float32 [H, W] or [H, W, 3], values as stored. InputError when the file is missing, truncated, larger than any
     picture once decoded, or not an EXR of that kind.
     """
-    check_decodable(path)
+    check_decodable(path, LARGEST_MAP)
     try:
         with OpenEXR.File(str(path)) as file:
             if not file.parts:

@@ -92,8 +92,12 @@ class ArrayFrame(SourceFrame):
         return self.array if size is None else cv2.resize(self.array, size, interpolation=cv2.INTER_AREA)
 
 
-def check_size(width: int, height: int, where: str, smallest: int = MIN_SIDE_PX) -> None:
-    """InputError for pictures too small to show anything or too large to decode safely."""
+def check_size(width: int, height: int, where: str, smallest: int = MIN_SIDE_PX, largest: int = 0) -> None:
+    """InputError for pictures too small to show anything or too large to decode safely.
+
+    smallest: px each way. largest: pixels, MAX_PIXELS where 0.
+    """
+    largest = largest or MAX_PIXELS
     if min(width, height) < 1:
         raise InputError("the picture's size cannot be read", where=where, mend="copy the file again")
     if min(width, height) < smallest:
@@ -101,10 +105,11 @@ def check_size(width: int, height: int, where: str, smallest: int = MIN_SIDE_PX)
             "the picture is too small", where=where, got=f"{width} x {height} px",
             expected=f"{smallest} px or more each way", mend="use the original file",
         )
-    if width * height > MAX_PIXELS:
+    if width * height > largest:
         raise InputError(
             "the picture is too large", where=where, got=f"{width} x {height} px",
-            expected=f"{MAX_PIXELS // 1_000_000} million pixels or fewer (8K video)", mend="scale the clip down",
+            expected=f"{largest // 1_000_000} million pixels or fewer" + " (8K video)" * (largest == MAX_PIXELS),
+            mend="scale the clip down" if largest == MAX_PIXELS else "scale it down",
         )
 
 
