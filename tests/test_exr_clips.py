@@ -13,7 +13,7 @@ from shared.errors import InputError
 from shared.io.export_maps import acescg_from_rec709
 from shared.io.exr_header import read_parts
 from shared.io.exr_picture import read_rec709
-from shared.io.images import read_exr, write_exr
+from shared.io.images import exr_size, read_exr, write_exr
 from shared.io.video import open_video
 from tools.relight_inputs import read_light
 
@@ -60,6 +60,7 @@ def test_headers_are_read_as_the_library_reads_them(tmp_path):
     assert [(c.name, c.kind) for c in part.channels] == [("A", 1), ("B", 2), ("G", 2), ("R", 2)]
     assert part.data == (3, 4, 63, 44) and part.display == (0, 0, 70, 50) and part.size == (60, 40)
     assert part.values["chromaticities"] == pytest.approx(AP1) and not part.deep
+    assert exr_size(path) == (60, 40)
     assert part.bytes() == 60 * 40 * (3 * 4 + 2)
     assert [p.size for p in read_parts(write_parts(tmp_path / "b.exr", [(20, 30), (50, 60)]))] == [(20, 30), (50, 60)]
 

@@ -13,7 +13,7 @@ import numpy as np
 import OpenEXR
 
 from shared.errors import InputError, LimnError
-from shared.io.exr_header import check_decodable
+from shared.io.exr_header import check_decodable, read_parts
 
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _ACESCG = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
@@ -138,6 +138,11 @@ def read_exr(path: Path | str) -> np.ndarray:
         raise InputError("an EXR of other channels", where=str(path), got=", ".join(sorted(channels)) or "none",
                          expected="R, G, B or one channel")
     return (colour if colour.ndim == 2 else colour[..., :3]).astype(np.float32)
+
+
+def exr_size(path: Path | str) -> tuple[int, int]:
+    """(width, height) as the header states it, without reading a pixel. InputError when it is not an EXR."""
+    return read_parts(path)[0].size
 
 
 def write_png(path: Path | str, array: np.ndarray) -> None:
