@@ -72,11 +72,28 @@ def find_subjects(folders: Sequence[Path], list_file: Path | None = None) -> lis
     """Subject folders: a folder without subject.yaml stands for those in it that have one; a list names one a line."""
     found: list[Path] = []
     for folder in [*folders, *(_listed(list_file) if list_file else ())]:
-        inside = [] if (folder / "subject.yaml").exists() or not folder.is_dir() else sorted(folder.iterdir())
-        found += [path for path in inside if (path / "subject.yaml").exists()] or [folder]
+        found += _subjects_in(folder) or [folder]
     if not found:
         raise InputError("no subjects", mend="give folders with subject.yaml, a folder of such, or --list FILE")
     return found
+
+
+def _subjects_in(folder: Path) -> list[Path]:
+    """The subjects in a folder of subjects; what this user may not look into (lost+found) is none of them."""
+    if _is_subject(folder) or not folder.is_dir():
+        return []
+    try:
+        inside = sorted(folder.iterdir())
+    except OSError as error:
+        raise InputError("cannot be read", where=str(folder), got=error.strerror, mend="check permissions") from error
+    return [path for path in inside if _is_subject(path)]
+
+
+def _is_subject(folder: Path) -> bool:
+    try:
+        return (folder / "subject.yaml").exists()
+    except OSError:
+        return False
 
 
 def _listed(path: Path) -> list[Path]:

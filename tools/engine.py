@@ -158,12 +158,23 @@ def _start(home: Path, settings: Settings, log: Path) -> subprocess.Popen:
         command += ["--resources", f"mem_mb={settings.memory_mb}"]
     if settings.profile:
         command += ["--profile", profile_folder(settings.profile)]
-    search = [str(REPOSITORY), os.environ.get("PYTHONPATH", "")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, search)), "TMPDIR": str(home / "tmp"),
-                                "PYTHONHASHSEED": "0"}  # so that the stages' interpreters need not start anew
+    environment = engine_environment(home)
     with open(log, "wb") as file:
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
                                 env=environment, cwd=home, start_new_session=True, preexec_fn=_die_with_parent)
+
+
+def engine_environment(home: Path) -> dict[str, str]:
+    """The environment of Snakemake: none of the user's settings for it, and its caches in the scratch folder.
+
+    It would write them into HOME, which a service's user may not have; XDG's variables are set for the engine alone.
+    """
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("SNAKEMAKE_")}
+    search = [str(REPOSITORY), kept.get("PYTHONPATH", "")]
+    caches = {name: str(home / "tmp") for name in ("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME")}
+    return kept | caches | {
+        "PYTHONPATH": os.pathsep.join(filter(None, search)), "TMPDIR": str(home / "tmp"),
+        "PYTHONHASHSEED": "0"}  # so that the stages' interpreters need not start anew
 
 
 def profile_folder(name: str) -> str:

@@ -15,6 +15,7 @@ from shared.contract.folders import RunFolder
 from shared.contract.manifest import outputs_digest, read_manifest, read_record, write_record
 from shared.contract.pipeline import Pipeline
 from shared.contract.wording import unknown_name
+from tools.records import is_line, number_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -126,7 +127,8 @@ def judge(run: RunFolder, pipeline: Pipeline) -> list[Flag]:
                if (manifest := read_manifest(run.published(name))) is not None}
     before = read_record(run.work / RECORD)
     if before and before.get("gates") == asked and before.get("results") == results:
-        return [Flag(**flag) for flag in before["flags"]]
+        if (flags := _flags_of(before)) is not None:
+            return flags
     values = {name: MEASURES[name](run) for name in pipeline.gates}
     flags = [Flag(name, value, pipeline.gates[name].limit) for name, value in values.items()
              if value is not None and not pipeline.gates[name].holds(value)]
@@ -139,6 +141,24 @@ def judge(run: RunFolder, pipeline: Pipeline) -> list[Flag]:
     write_record(run.work / RECORD, {"gates": asked, "results": results, "values": values,
                                      "flags": [asdict(flag) for flag in flags]})
     return flags
+
+
+def read_flags(run: RunFolder) -> list[Flag]:
+    """The gates that were missed when the result was last judged; none where the record is absent or damaged."""
+    return _flags_of(read_record(run.work / RECORD)) or []
+
+
+def _flags_of(record: object) -> list[Flag] | None:
+    """The record's flags; None where it does not hold any that could have been written."""
+    flags = record.get("flags") if isinstance(record, dict) else None
+    if not isinstance(flags, list):
+        return None
+    for flag in flags:
+        if not isinstance(flag, dict) or flag.keys() != {"gate", "value", "limit"}:
+            return None
+        if number_of(flag, "value") is None or not (is_line(flag["gate"]) and is_line(flag["limit"])):
+            return None
+    return [Flag(**flag) for flag in flags]
 
 
 def confidence_map(run: RunFolder) -> Path:
@@ -157,5 +177,5 @@ def _seen(run: RunFolder) -> np.ndarray | None:
 
 
 def _number(record: object, name: str) -> float | None:
-    value = record.get(name) if isinstance(record, dict) else None
-    return float(value) if isinstance(value, int | float) else None
+    value = number_of(record, name)
+    return None if value is None else float(value)

@@ -186,7 +186,7 @@ def run_command(args: argparse.Namespace) -> int:
                  for name in pipeline.stages}
     return run_cases(opened, Settings(
         pipeline, parameters, arguments, args.out, cores, memory_mb, args.threads, args.profile,
-        default_summary(args.subjects, args.out, args.summary), args.renew))
+        default_summary(args.subjects, args.out, args.summary, [case.run.root for case in opened.cases]), args.renew))
 
 
 def plan_command(args: argparse.Namespace) -> int:
@@ -286,8 +286,14 @@ def _for_each_plan(args: argparse.Namespace, show) -> int:
     parameters = all_parameters(pipeline, args.preset, args.set)
     opened = open_cases(find_subjects(args.subjects, args.list), args.out)
     for case in opened.cases:
-        show(case, plan_case(pipeline, case, parameters, getattr(args, "verify", False),
-                             getattr(args, "renew", False)))
+        try:
+            show(case, plan_case(pipeline, case, parameters, getattr(args, "verify", False),
+                                 getattr(args, "renew", False)))
+        except InputError as error:
+            opened.faults.append((case.subject.folder, error))
+        except OSError as error:
+            fault = InputError("cannot be read", where=str(error.filename or case.run.root), got=error.strerror)
+            opened.faults.append((case.subject.folder, fault))
     opened.all()
     return 0
 

@@ -8,12 +8,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from shared.contract.disk import FULL_BELOW_BYTES, free_bytes
-from shared.contract.manifest import LOG, PROVENANCE, read_record, write_record
+from shared.contract.manifest import LOG, write_record
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
 from tools.cases import Case
 from tools.gates import PICTURE, Flag, judge
 from tools.plan import CURRENT, StagePlan, kept_lines
+from tools.records import read_cost
 from tools.watch import Track
 
 SCHEMA = 1
@@ -87,11 +88,11 @@ def outcome_of(case: Case, pipeline: Pipeline, plans: Mapping[str, StagePlan], t
 
 def costs_of(case: Case, pipeline: Pipeline) -> dict[str, object]:
     """Minutes in all, highest memory, bytes and warnings of the published stages."""
-    records = [read_record(part.run.published(name) / PROVENANCE) or {} for part, name in case.jobs(pipeline)]
-    warnings = [text for record in records for text in record.get("warnings", ())]
-    return {"minutes": round(sum(record.get("wall_s", 0.0) for record in records) / 60, 2),
-            "memory_mb": max((record.get("peak_memory_mb", 0.0) for record in records), default=0.0),
-            "bytes": sum(record.get("bytes", 0) for record in records), "warnings": tuple(warnings)}
+    costs = [read_cost(part.run.published(name)) for part, name in case.jobs(pipeline)]
+    return {"minutes": round(sum(cost.wall_s or 0.0 for cost in costs) / 60, 2),
+            "memory_mb": max((cost.peak_memory_mb or 0.0 for cost in costs), default=0.0),
+            "bytes": sum(int(cost.bytes or 0) for cost in costs),
+            "warnings": tuple(text for cost in costs for text in cost.warnings)}
 
 
 def write_summary(path: Path, outcomes: Sequence[Outcome], started: str, seconds: float) -> None:

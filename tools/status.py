@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 
-from shared.contract.manifest import PROVENANCE, read_record
 from tools.cases import Case
 from tools.engine import EVENTS, SCRATCH
-from tools.gates import RECORD, Flag
+from tools.gates import read_flags
 from tools.housekeeping import folder_size, readable_size
 from tools.plan import CURRENT, StagePlan
+from tools.records import read_cost
 from tools.watch import Track
 
 HEADER = f"{'state':9} {'size':>10} {'seconds':>8} {'peak':>9}  {'started':25}  folder"
@@ -22,18 +22,18 @@ def status_of(case: Case, plans: Mapping[str, StagePlan]) -> dict[str, object]:
     stages = []
     for name, plan in plans.items():
         folder, track = plan.case.run.published(plan.name), live.get(name)
-        provenance = read_record(folder / PROVENANCE) or {}
+        cost = read_cost(folder)
         failed = plan.case.run.failed(plan.name) / "log.txt"
         stages.append({
             "stage": name, "state": "running" if track else plan.state, "reasons": list(plan.reasons),
-            "bytes": folder_size(folder) if folder.is_dir() else None, "seconds": provenance.get("wall_s"),
-            "peak_memory_mb": provenance.get("peak_memory_mb"), "started": provenance.get("started"),
+            "bytes": folder_size(folder) if folder.is_dir() else None, "seconds": cost.wall_s,
+            "peak_memory_mb": cost.peak_memory_mb, "started": cost.started,
             "folder": str(folder.relative_to(case.run.root)) if folder.is_dir() else None,
             "progress": track.progress if track else "",
             "running_s": round(max(0.0, time.time() - track.since), 1) if track else None,
             "failed_log": str(failed) if failed.is_file() else "",
         })
-    flags = [str(Flag(**flag)) for flag in (read_record(case.run.work / RECORD) or {}).get("flags", ())]
+    flags = [str(flag) for flag in read_flags(case.run)]
     current = all(plan.state == CURRENT for plan in plans.values())
     return {"subject": case.name, "folder": str(case.subject.folder), "results": str(case.run.root),
             "running": case.run.is_locked("run"), "flags": flags if current else [], "stages": stages}

@@ -205,12 +205,24 @@ def _interrupt(_signal: int, _frame: object) -> None:
     raise KeyboardInterrupt
 
 
-def default_summary(subjects: Sequence[Path], out: Path | None, given: Path | None) -> Path | None:
-    """Where summary.json goes: as told, else to --out, else into the one folder of subjects that was given."""
+def default_summary(subjects: Sequence[Path], out: Path | None, given: Path | None,
+                    results: Sequence[Path] = ()) -> Path | None:
+    """Where summary.json goes: as told, else to --out, else into the one folder of subjects that was given.
+
+    Where a folder has that name, or one of the results will, it is called summary-2.json, and a line says so.
+    InputError where a folder was told.
+    """
     if given is not None:
+        if given.is_dir():
+            raise InputError("a folder, not a file", where="--summary", got=given, expected="a file's name")
         return given
-    if out is not None:
-        return Path(os.path.abspath(out)) / "summary.json"
-    if len(subjects) == 1 and not (subjects[0] / "subject.yaml").exists():
-        return Path(os.path.abspath(subjects[0])) / "summary.json"
-    return None
+    if out is None and (len(subjects) != 1 or (subjects[0] / "subject.yaml").exists()):
+        return None
+    folder = Path(os.path.abspath(subjects[0] if out is None else out))
+    names = ["summary.json", *(f"summary-{i}.json" for i in range(2, len(results) + 3))]
+    free = [folder / name for name in names if folder / name not in results and not (folder / name).is_dir()]
+    if not free:
+        raise InputError("no free name for the summary", where=str(folder), mend="name a place with --summary FILE")
+    if free[0].name != names[0]:
+        _say(f"limn: {folder / names[0]} is a folder: the summary goes to {free[0]}")
+    return free[0]

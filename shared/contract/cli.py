@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from shared.contract.folders import RunFolder
 from shared.contract.hashing import HashMemory
 from shared.contract.interpreter import set_threads, settle
 from shared.contract.job import Job
+from shared.contract.manifest import read_manifest
 from shared.contract.needs import amount, measured_scale, scale_of
 from shared.contract.pipeline import REPOSITORY, Pipeline, load_pipeline, split_settings
 from shared.contract.progress import Reporter
@@ -143,7 +144,7 @@ def parse_request(stage: Stage, argv: Sequence[str] | None) -> Request:
     run = RunFolder.of(subject.folder, subject.name, args.out)
     if subject.clips or args.clip is not None:
         subject, run = _part(stage, subject, run, args.clip, bool(stage.joins) or stage.name in pipeline.joint)
-    disk_mb = _disk_needed(pipeline, stage, args.preset, run)
+    disk_mb = _disk_needed(pipeline, stage, args.preset, parameters, run)
     return Request(stage, subject, run, parameters, threads, args.force, args.verify, args.events, disk_mb, args.renew,
                    pipeline.code_roots)
 
@@ -160,11 +161,27 @@ def _part(stage: Stage, subject: Subject, run: RunFolder, clip: str | None, join
     return subject.clip(clip, "--clip"), run.of_clip(clip)
 
 
-def _disk_needed(pipeline: Pipeline, stage: Stage, preset: str | None, run: RunFolder) -> float | None:
-    """MB that the stage is expected to write, with a tenth on top; None where pipeline.yaml does not say."""
+def _disk_needed(pipeline: Pipeline, stage: Stage, preset: str | None, own: Mapping[str, object],
+                 run: RunFolder) -> float | None:
+    """MB that the stage is expected to write, with a tenth on top; None where pipeline.yaml does not say.
+
+    own: the stage's parameters as they are set. Of another stage those count with which it ran, as far as they are
+    allowed ones; else the preset's.
+    """
     step = pipeline.steps.get(stage.name)
     if step is None or "disk_mb" not in step.resources:
         return None
-    parameters = {name: pipeline.parameters(other, preset, {}) for name, other in pipeline.stages.items()}
+    parameters = {name: own if name == stage.name else _used(pipeline, other, preset, run)
+                  for name, other in pipeline.stages.items()}
     expected = scale_of(pipeline.sizes, pipeline.stages, parameters, str(pipeline.path))
     return 1.1 * amount(step.resources, "disk_mb", measured_scale(run.root, expected))
+
+
+def _used(pipeline: Pipeline, stage: Stage, preset: str | None, run: RunFolder) -> Mapping[str, object]:
+    """The parameters with which a stage ran, as its manifest says."""
+    ran = (read_manifest(run.published(stage.name)) or {}).get("parameters")
+    ran = ran if isinstance(ran, dict) else {}
+    try:
+        return pipeline.parameters(stage, preset, {p.name: ran[p.name] for p in stage.parameters if p.name in ran})
+    except InputError:  # those of another version, or a damaged record
+        return pipeline.parameters(stage, preset, {})

@@ -57,7 +57,18 @@ def check_link(path: Path, folder: Path) -> None:
 
 
 def check_results(root: Path, work: Path) -> None:
-    """InputError for symbolic links in place of results: writing or cleaning would reach through them."""
+    """InputError for symbolic links in place of results: writing or cleaning would reach through them.
+
+    So it is for results that this user may not look at.
+    """
+    try:
+        _check_links(root, work)
+    except OSError as error:
+        raise InputError("cannot be read", where=str(error.filename or work), got=error.strerror,
+                         mend="check its permissions, or write elsewhere with --out DIR") from error
+
+
+def _check_links(root: Path, work: Path) -> None:
     for path in (work, root / "export"):
         if path.is_symlink() and not is_trusted(path):
             raise InputError("a symbolic link in place of results", where=str(path), got=f"-> {os.path.realpath(path)}",

@@ -21,6 +21,7 @@ from shared.errors import InputError
 CLIPS = "clips"
 _HERE, _EXCHANGE = -100, 2
 """AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""
+_MOST_TRIES = 1000
 
 
 class RunFolder:
@@ -35,6 +36,7 @@ class RunFolder:
         """The subject's own folder, or out/<name of the subject>; InputError for links in place of results."""
         run = cls(Path(os.path.abspath(out)) / name if out else folder)
         check_results(run.root, run.work)
+        run.clips()
         return run
 
     def of_clip(self, name: str) -> RunFolder:
@@ -45,8 +47,8 @@ class RunFolder:
         return clip
 
     def clips(self) -> list[RunFolder]:
-        """The folders of all clips that ever ran."""
-        return [RunFolder(path) for path in sorted((self.work / CLIPS).glob("*"))]
+        """The folders of all clips that ever ran; InputError for links in place of them or of their results."""
+        return [self.of_clip(path.name) for path in sorted((self.work / CLIPS).glob("*"))]
 
     def published(self, name: str) -> Path:
         """The stage's folder."""
@@ -200,14 +202,20 @@ def _is_held(path: Path) -> bool:
 
 
 def _acquire(path: Path, deadline: float) -> int:
-    """File descriptor of the lock, held; its file holds the process id."""
+    """File descriptor of the lock, held; its file holds the process id.
+
+    A process that releases its lock removes the empty folder, too, between our making it and our opening the lock:
+    that is tried again. Where no folder can be made at all (/proc), it is as absent after many tries.
+    """
+    tries = 0
     while True:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
-        except FileNotFoundError:
-            continue
         except OSError as error:
+            tries += 1
+            if isinstance(error, FileNotFoundError) and tries < _MOST_TRIES:
+                continue
             raise InputError("cannot write here", where=str(path.parent), got=error.strerror,
                              mend="write elsewhere with --out DIR") from error
         try:

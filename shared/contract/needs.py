@@ -26,6 +26,8 @@ KINDS = ("mem_mb", "runtime", "disk_mb")
 """Megabytes of memory, minutes, megabytes on disk: Snakemake's names."""
 TERMS = ("base", "frame", "megapixel", "frame_megapixel", "map_megapixel")
 SIZES = ("frames", "crop_px", "map_px")
+LARGEST_EDGE_PX = 1 << 16
+"""A frame with a longer edge is no frame of ours: its record is damaged."""
 _AMOUNT = Parameter("amount", float, 0.0, "What one unit needs.", "", 0.0, 1e9)
 
 
@@ -94,7 +96,10 @@ def measured_scale(run: Path, expected: Scale) -> Scale:
     paths = sorted((run / "work" / "clips").glob(f"*/work/{record}")) or [run / "work" / record]
     try:
         contents = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
-        areas = [float(width) * float(height) for width, height in (content["size"] for content in contents)]
+        edges = [[float(edge) for edge in content["size"]] for content in contents]
+        if not all(0 < edge <= LARGEST_EDGE_PX for pair in edges for edge in pair):
+            return expected
+        areas = [width * height for width, height in edges]
         return Scale(sum(len(content["frames"]) for content in contents), max(areas) ** 0.5, expected.map_px)
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return expected

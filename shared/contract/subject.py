@@ -186,6 +186,8 @@ def _tracking(folder: Path, given: object, where: str) -> dict[str, object]:
         if not file.is_file() or file.stat().st_size == 0:
             raise InputError("no such file, or empty", where=f"{where}.{name}", got=given[name])
         check_link(file, folder)
+        with open(file, "rb"):
+            pass
     hold = given.get("hold_poses", False)
     if not isinstance(hold, bool):
         raise InputError("value not known", where=f"{where}.hold_poses", got=shown(hold), expected="true | false")
@@ -216,7 +218,8 @@ def _check_files(subject: Subject) -> None:
     total = 0
     for file in files:
         check_link(file, subject.folder)
-        size = file.stat().st_size
+        with open(file, "rb"):  # whether this user may read it
+            size = file.stat().st_size
         total += size
         if size == 0:
             raise InputError("the file is empty", where=str(file), mend="copy it from the camera again")

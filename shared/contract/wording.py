@@ -67,6 +67,23 @@ class _StrictLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int | str:
+        """060 is sixty, as in YAML 1.2 and on every lens; 1:30 stays text instead of ninety."""
+        text = self.construct_scalar(node).replace("_", "")
+        if ":" in text:
+            return text
+        return int(text, 10) if text.lstrip("+-").isdigit() else super().construct_yaml_int(node)
+
+    def construct_yaml_float(self, node: yaml.ScalarNode) -> float | str:
+        """1:30.5 stays text."""
+        text = self.construct_scalar(node)
+        return text if ":" in text else super().construct_yaml_float(node)
+
+
+for _kind in ("int", "float"):
+    _StrictLoader.add_constructor(f"tag:yaml.org,2002:{_kind}", getattr(_StrictLoader, f"construct_yaml_{_kind}"))
+
+
 def read_yaml(path: Path) -> object:
     """The content of a small YAML file, by the safe loader; InputError with the line when it is not valid."""
     data = _read_settings(path)

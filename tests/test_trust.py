@@ -1,0 +1,250 @@
+"""Nobody else's files, no subject in the way of others: links out of work/, planted records, other users."""
+
+import json
+import os
+import random
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from toy_runs import REPOSITORY, copy_pipeline, limn, make_subject
+
+from shared.contract.cli import parse_request
+from shared.contract.needs import Scale, measured_scale
+from shared.contract.source import read_declaration
+from shared.contract.wording import read_yaml
+from shared.errors import InputError
+from tools.limn import main
+
+NOBODY = 65534
+COMMANDS = ("run", "plan", "status", "report", "clean")
+PLANTED = (None, True, -1, 1e200, 1e999, "x", "\x1b[2J", [], [[]], {}, {"a": []}, "0" * 5000, 10**400)
+
+
+@pytest.fixture
+def pipeline(tmp_path):
+    return copy_pipeline(tmp_path / "toy")
+
+
+def contents(folder):
+    """{path: bytes or link} of all that lies below."""
+    return {path: os.readlink(path) if path.is_symlink() else path.read_bytes() if path.is_file() else None
+            for path in sorted(folder.rglob("*"))}
+
+
+def link_clip(evil, victim):
+    (evil / "work" / "clips").mkdir(parents=True)
+    (evil / "work" / "clips" / "x").symlink_to(victim)
+
+
+def link_clips(evil, victim):
+    (evil / "work").mkdir()
+    (evil / "work" / "clips").symlink_to(victim.parent)
+
+
+def link_work_of_clip(evil, victim):
+    (evil / "work" / "clips" / "x").mkdir(parents=True)
+    (evil / "work" / "clips" / "x" / "work").symlink_to(victim / "work")
+
+
+def link_stage_of_clip(evil, victim):
+    (evil / "work" / "clips" / "x" / "work").mkdir(parents=True)
+    (evil / "work" / "clips" / "x" / "work" / "read_text").symlink_to(victim / "work" / "read_text")
+
+
+def link_stage(evil, victim):
+    (evil / "work").mkdir()
+    (evil / "work" / "read_text").symlink_to(victim / "work" / "read_text")
+
+
+def link_export(evil, victim):
+    (evil / "export").symlink_to(victim / "export")
+
+
+LINKS = (link_clip, link_clips, link_work_of_clip, link_stage_of_clip, link_stage, link_export)
+
+
+@pytest.mark.parametrize("plant", LINKS, ids=lambda plant: plant.__name__)
+def test_no_command_reaches_through_links(tmp_path, pipeline, capsys, monkeypatch, plant):
+    monkeypatch.setenv("LIMN_TRUST", str(tmp_path / "toy"))
+    victim = make_subject(tmp_path / "victim")
+    for name in ("read_text", "count_words"):
+        (victim / "work" / name).mkdir(parents=True)
+        (victim / "work" / name / "precious").write_text("keep me")
+    (victim / "export").mkdir()
+    evil = make_subject(tmp_path / "evil")
+    plant(evil, victim)
+    before = contents(tmp_path)
+    for command in COMMANDS:
+        assert main([command, str(evil), "--pipeline", str(pipeline)]) == 2, command
+        error = capsys.readouterr().err
+        assert "a symbolic link in place of results" in error and error.count("\n") == 1
+    assert contents(tmp_path) == before
+
+
+def test_planted_sizes_are_no_sizes(tmp_path):
+    folder = tmp_path / "work" / "clips" / "x" / "work" / "sample_frames"
+    folder.mkdir(parents=True)
+    expected = Scale(10, 20, 30)
+    for size in ([1e200, 1e200], [1e999, 1], [-1, -1], [0, 5], [10**400, 1], "ab", {}, None, [[], []]):
+        (folder / "frames.json").write_text(json.dumps({"size": size, "frames": []}))
+        assert measured_scale(tmp_path, expected) == expected, size
+    (folder / "frames.json").write_text("[" * 100_000)
+    assert measured_scale(tmp_path, expected) == expected
+
+
+def damaged(record, rng):
+    """The record as JSON with one of its values, at any depth, replaced, or cut, or of another kind."""
+    record = json.loads(json.dumps(record))
+    kind = rng.randrange(8)
+    if kind == 0:
+        text = json.dumps(record)
+        return text[:rng.randrange(len(text))].encode()
+    if kind == 1:
+        return rng.choice([b"", b"\xff\xfe", b"[" * 50_000, b"7", b"NaN"])
+    place = record
+    while True:
+        keys = list(place) if isinstance(place, dict) else list(range(len(place)))
+        key = rng.choice(keys)
+        if not (isinstance(place[key], dict | list) and place[key]) or rng.random() < 0.3:
+            break
+        place = place[key]
+    place[key] = rng.choice(PLANTED)
+    return json.dumps(record).encode()
+
+
+def test_damaged_records_stop_no_command(tmp_path, pipeline, capsys, monkeypatch):
+    """LIMN_SLOW_TESTS=1: fifty times as many."""
+    subject = make_subject(tmp_path / "anna")
+    assert limn("run", subject, "--pipeline", pipeline, LIMN_TRUST=str(tmp_path / "toy"))[0] == 0
+    flags = [{"gate": "coverage", "value": 0.1, "limit": "0.5 or more"}]
+    (subject / "work" / "quality.json").write_text(json.dumps({"gates": {}, "results": {}, "flags": flags}))
+    sound = {path: path.read_bytes() for path in subject.rglob("*.json")}
+    assert len(sound) >= 10
+    rng = random.Random(7)
+    for i in range(40 * (50 if os.environ.get("LIMN_SLOW_TESTS") else 1)):
+        for path, data in sound.items():
+            path.write_bytes(data)
+        path = rng.choice(sorted(sound))
+        path.write_bytes(damaged(json.loads(sound[path]), rng))
+        for command in ("status", "plan"):
+            code = main([command, str(subject), "--pipeline", str(pipeline)])
+            assert code == 0, (i, command, path, path.read_bytes()[:300])
+        assert "\x1b" not in capsys.readouterr().out
+
+
+def test_hostile_subjects_stop_no_sound_one(tmp_path, pipeline):
+    batch = tmp_path / "batch"
+    make_subject(batch / "sound")
+    make_subject(batch / "costly")
+    make_subject(batch / "summary.json")
+    arguments = ("run", batch, "--pipeline", pipeline)
+    trusted = {"LIMN_TRUST": str(tmp_path / "toy")}
+    assert limn("run", batch / "costly", "--pipeline", pipeline, **trusted)[0] == 0
+    for path in (batch / "costly").rglob("provenance.json"):
+        path.write_text('{"wall_s": "x", "warnings": 3, "bytes": null, "peak_memory_mb": []}')
+    (batch / "costly" / "work" / "quality.json").write_text('{"flags": [{"x": 1}]}')
+    planted = make_subject(batch / "planted") / "work" / "clips" / "x" / "work" / "sample_frames"
+    planted.mkdir(parents=True)
+    (planted / "frames.json").write_text('{"size": [1e200, 1e200], "frames": []}')
+    link_clip(make_subject(batch / "linked"), batch / "sound")
+    code, output = limn(*arguments, **trusted)
+    assert code == 2 and "Traceback" not in output and "5 subjects: 4 done, 1 input error" in output, output
+    assert (batch / "sound" / "export" / "page.txt").is_file()
+    assert json.loads((batch / "summary-2.json").read_text())["exit_code"] == 2
+
+
+def as_nobody(*arguments, **environment):
+    """limn as a user that owns nothing; returns (exit code, output)."""
+    def drop():
+        os.setgroups([])
+        os.setgid(NOBODY)
+        os.setuid(NOBODY)
+
+    done = subprocess.run([sys.executable, "-m", "tools.limn", *map(str, arguments)], text=True, timeout=120, cwd="/",
+                          env={**os.environ, "PYTHONPATH": str(REPOSITORY), "PYTHONDONTWRITEBYTECODE": "1",
+                               **environment}, preexec_fn=drop, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                          stderr=subprocess.STDOUT)
+    return done.returncode, done.stdout
+
+
+@pytest.fixture
+def shared_folder(tmp_path):
+    """A folder that every user reaches; skipped where there is no changing the user."""
+    if os.geteuid() != 0:
+        pytest.skip("only root can run as another user")
+    folder = tmp_path
+    while not folder.stat().st_mode & stat.S_IXOTH or folder == tmp_path:
+        folder.chmod(folder.stat().st_mode | 0o055)
+        folder = folder.parent
+    if any(not parent.stat().st_mode & stat.S_IXOTH for parent in Path(sys.executable).resolve().parents):
+        pytest.skip("another user cannot reach this Python")
+    return tmp_path
+
+
+def test_another_user_without_a_home(shared_folder, pipeline):
+    """Closed siblings and clips are these subjects' faults; the sound one runs, HOME or Snakemake's settings or not."""
+    batch, out = shared_folder / "batch", shared_folder / "out"
+    for name in ("sound", "closed", "clip", "work"):
+        make_subject(batch / name)
+    (batch / "lost+found").mkdir()
+    (batch / "work" / "work").mkdir()
+    for path in (batch / "closed", batch / "lost+found", batch / "work" / "work", batch / "clip" / "clip.txt"):
+        path.chmod(0)
+    out.mkdir()
+    shutil.chown(out, NOBODY, NOBODY)
+    code, output = as_nobody("run", batch, "--pipeline", pipeline, "--out", out, HOME="/nonexistent/home",
+                             SNAKEMAKE_PROFILE="nothing-of-that-name", LIMN_TRUST=str(shared_folder / "toy"))
+    assert code == 2 and "Traceback" not in output, output
+    assert (out / "sound" / "export" / "page.txt").is_file(), output
+    assert (out / "work" / "export" / "page.txt").is_file()
+    assert "clip.txt: cannot be read" in output or "cannot be read" in output
+    assert "3 subjects: 2 done, 1 input error" in output, output
+    code, output = as_nobody("status", batch, "--pipeline", pipeline, LIMN_TRUST=str(shared_folder / "toy"))
+    assert code == 2 and "Traceback" not in output and str(batch / "work" / "work") in output, output
+
+
+def test_out_where_no_folder_can_be(tmp_path, pipeline):
+    subject = make_subject(tmp_path / "anna")
+    code, output = limn("run", subject, "--pipeline", pipeline, "--out", "/proc/limn", LIMN_TRUST=str(tmp_path / "toy"))
+    assert code == 2 and "cannot write here" in output and output.count("\n") == 1, output
+
+
+@pytest.mark.parametrize("text, value", [("060", 60), ("-010", -10), ("08.5", 8.5), ("0x10", 16), ("1_000", 1000),
+                                         ("1:30", "1:30"), ("1:30.5", "1:30.5"), ("60", 60), ("off", False)])
+def test_numbers_of_settings_are_what_they_look_like(tmp_path, text, value):
+    (tmp_path / "a.yaml").write_text(f"x: {text}\n")
+    read = read_yaml(tmp_path / "a.yaml")["x"]
+    assert read == value and type(read) is type(value)
+
+
+def test_disk_follows_settings(tmp_path, pipeline):
+    from shared.contract.confine import trust
+
+    trust([tmp_path / "toy"])
+    subject = make_subject(tmp_path / "anna")
+    pipeline.write_text("sizes: {frames: draw_bars.width}\n" + pipeline.read_text().replace(
+        "threads: 1}", "threads: 1, resources: {disk_mb: {frame: 10}}}"))
+    stage = read_declaration(tmp_path / "toy" / "toy" / "draw_bars.py")
+    needed = [parse_request(stage, ["--subject", str(subject), "--pipeline", str(pipeline), *given]).disk_mb
+              for given in ([], ["--set", "width=40"])]
+    assert needed[1] == pytest.approx(440) and needed[0] != needed[1]
+
+
+def test_summary_is_never_a_folder(tmp_path):
+    from tools.workflow import default_summary
+
+    with pytest.raises(InputError, match="a folder, not a file"):
+        default_summary([], None, tmp_path)
+    assert default_summary([], tmp_path, None) == tmp_path / "summary.json"
+    assert default_summary([], tmp_path, None, [tmp_path / "summary.json"]) == tmp_path / "summary-2.json"
+
+
+def test_no_home_and_a_profile_in_the_environment(tmp_path, pipeline):
+    subject = make_subject(tmp_path / "anna")
+    code, output = limn("run", subject, "--pipeline", pipeline, HOME="/proc/none", LIMN_TRUST=str(tmp_path / "toy"),
+                        XDG_CACHE_HOME="/proc/none", SNAKEMAKE_PROFILE="nothing-of-that-name")
+    assert code == 0, output
