@@ -17,10 +17,10 @@ from shared.contract.manifest import write_record
 from shared.contract.pipeline import load_pipeline
 from shared.io.images import write_exr
 from stages import export_usd
-from tools.gates import RECORD, Flag
+from tools.gates import RECORD, Flag, read_flags
 from tools.limn import main
 from tools.outcome import Outcome
-from tools.overview import flags_of, overview_page, page_beside, values_of, write_overview
+from tools.overview import overview_page, page_beside, values_of, write_overview
 from tools.thumbnails import crop_pictures, result_pictures
 
 NAME = '<script>alert("1")</script> & co'
@@ -130,7 +130,7 @@ def test_damaged_records_are_as_good_as_none(tmp_path, record):
     run = RunFolder(tmp_path)
     run.work.mkdir()
     (run.work / RECORD).write_text(record)
-    assert values_of(run) == {} and flags_of(run) == []
+    assert values_of(run) == {} and read_flags(run) == []
 
 
 def test_page_of_a_run_and_of_what_lies_there(tmp_path, capsys):

@@ -10,17 +10,23 @@ import sys
 from pathlib import Path
 
 import pytest
+from slow import SLOW
 from toy_runs import REPOSITORY, copy_pipeline, limn, make_subject
 
 from shared.contract.cli import parse_request
+from shared.contract.folders import RunFolder
+from shared.contract.hashing import HashMemory, hash_file
 from shared.contract.needs import Scale, measured_scale
 from shared.contract.source import read_declaration
 from shared.contract.wording import read_yaml
 from shared.errors import InputError
+from tools.gates import clips_of
 from tools.limn import main
+from tools.plan import plan_case
 
 NOBODY = 65534
-COMMANDS = ("run", "plan", "status", "report", "clean")
+COMMANDS = ("run", "plan", "status", "report", "overview", "clean", "validate")
+READERS = ("plan", "status", "report", "overview", "clean --dry-run", "plan --until count_words", "plan --renew")
 PLANTED = (None, True, -1, 1e200, 1e999, "x", "\x1b[2J", [], [[]], {}, {"a": []}, "0" * 5000, 10**400)
 
 
@@ -68,7 +74,7 @@ LINKS = (link_clip, link_clips, link_work_of_clip, link_stage_of_clip, link_stag
 
 
 @pytest.mark.parametrize("plant", LINKS, ids=lambda plant: plant.__name__)
-def test_no_command_reaches_through_links(tmp_path, pipeline, capsys, monkeypatch, plant):
+def test_no_command_reaches_through_links(tmp_path, tmp_path_factory, pipeline, capsys, monkeypatch, plant):
     monkeypatch.setenv("LIMN_TRUST", str(tmp_path / "toy"))
     victim = make_subject(tmp_path / "victim")
     for name in ("read_text", "count_words"):
@@ -77,11 +83,15 @@ def test_no_command_reaches_through_links(tmp_path, pipeline, capsys, monkeypatc
     (victim / "export").mkdir()
     evil = make_subject(tmp_path / "evil")
     plant(evil, victim)
+    page = tmp_path_factory.mktemp("pages") / "overview.html"
     before = contents(tmp_path)
     for command in COMMANDS:
-        assert main([command, str(evil), "--pipeline", str(pipeline)]) == 2, command
-        error = capsys.readouterr().err
-        assert "a symbolic link in place of results" in error and error.count("\n") == 1
+        options = [] if command == "validate" else ["--pipeline", str(pipeline)]
+        options += ["--page", str(page)] if command == "overview" else []
+        for more in ([], ["--until", "count_words"]) if command in ("run", "plan") else ([],):
+            assert main([command, str(evil), *options, *more]) == 2, command
+            error = capsys.readouterr().err
+            assert "a symbolic link in place of results" in error and error.count("\n") == 1
     assert contents(tmp_path) == before
 
 
@@ -117,7 +127,7 @@ def damaged(record, rng):
 
 
 def test_damaged_records_stop_no_command(tmp_path, pipeline, capsys, monkeypatch):
-    """LIMN_SLOW_TESTS=1: fifty times as many."""
+    """In full: fifty times as many."""
     subject = make_subject(tmp_path / "anna")
     assert limn("run", subject, "--pipeline", pipeline, LIMN_TRUST=str(tmp_path / "toy"))[0] == 0
     flags = [{"gate": "coverage", "value": 0.1, "limit": "0.5 or more"}]
@@ -125,15 +135,23 @@ def test_damaged_records_stop_no_command(tmp_path, pipeline, capsys, monkeypatch
     sound = {path: path.read_bytes() for path in subject.rglob("*.json")}
     assert len(sound) >= 10
     rng = random.Random(7)
-    for i in range(40 * (50 if os.environ.get("LIMN_SLOW_TESTS") else 1)):
+    for i in range(40 * (50 if SLOW else 1)):
         for path, data in sound.items():
             path.write_bytes(data)
         path = rng.choice(sorted(sound))
         path.write_bytes(damaged(json.loads(sound[path]), rng))
-        for command in ("status", "plan"):
-            code = main([command, str(subject), "--pipeline", str(pipeline)])
-            assert code == 0, (i, command, path, path.read_bytes()[:300])
-        assert "\x1b" not in capsys.readouterr().out
+        data = path.read_bytes()
+        for command in READERS:
+            options = ["--page", str(tmp_path / "page.html")] if command == "overview" else []
+            code = main([*command.split(), str(subject), "--pipeline", str(pipeline), *options])
+            assert code == 0, (i, command, path, data[:300])
+        shown = capsys.readouterr()
+        assert "\x1b" not in shown.out + shown.err + (tmp_path / "page.html").read_text()
+        if SLOW and i % 20 == 0:
+            path.write_bytes(data)
+            code, output = limn("run", subject, "--pipeline", pipeline, LIMN_TRUST=str(tmp_path / "toy"))
+            assert code == 0 and "\x1b" not in output, (i, path, data[:300], output)
+            sound = {path: path.read_bytes() for path in subject.rglob("*.json")}
 
 
 def test_hostile_subjects_stop_no_sound_one(tmp_path, pipeline):
@@ -241,6 +259,12 @@ def test_summary_is_never_a_folder(tmp_path):
         default_summary([], None, tmp_path)
     assert default_summary([], tmp_path, None) == tmp_path / "summary.json"
     assert default_summary([], tmp_path, None, [tmp_path / "summary.json"]) == tmp_path / "summary-2.json"
+    taken = [tmp_path / "summary.html", tmp_path / "summary-2.json"]
+    assert default_summary([], tmp_path, None, taken) == tmp_path / "summary-3.json"
+    (tmp_path / "summary-3.html").mkdir()
+    assert default_summary([], tmp_path, None, taken) == tmp_path / "summary-4.json"
+    with pytest.raises(InputError, match="a folder, not a file"):
+        default_summary([], None, tmp_path / "summary-3.json")
 
 
 def test_no_home_and_a_profile_in_the_environment(tmp_path, pipeline):
@@ -248,3 +272,75 @@ def test_no_home_and_a_profile_in_the_environment(tmp_path, pipeline):
     code, output = limn("run", subject, "--pipeline", pipeline, HOME="/proc/none", LIMN_TRUST=str(tmp_path / "toy"),
                         XDG_CACHE_HOME="/proc/none", SNAKEMAKE_PROFILE="nothing-of-that-name")
     assert code == 0, output
+
+
+def test_one_linked_subject_keeps_no_other_from_being_cleaned(tmp_path, pipeline, capsys):
+    for name in ("anna", "carl"):
+        work = make_subject(tmp_path / "batch" / name) / "work" / "read_text"
+        work.mkdir(parents=True)
+    link_stage(make_subject(tmp_path / "batch" / "bert"), tmp_path / "batch" / "anna")
+    assert main(["clean", str(tmp_path / "batch"), "--pipeline", str(pipeline)]) == 2
+    assert "a symbolic link in place of results" in capsys.readouterr().err
+    assert not (tmp_path / "batch" / "anna" / "work").exists() and not (tmp_path / "batch" / "carl" / "work").exists()
+
+
+@pytest.mark.parametrize("command", ["plan", "status", "overview", "run"])
+def test_our_own_failure_on_one_subject_is_told_and_stops_no_other(tmp_path, pipeline, capsys, monkeypatch, command):
+    """As a planted record would do that gets past all checks."""
+    monkeypatch.setenv("LIMN_TRUST", str(tmp_path / "toy"))
+    for name in ("anna", "bert"):
+        make_subject(tmp_path / "batch" / name)
+    for module in ("tools.limn", "tools.workflow"):
+        monkeypatch.setattr(f"{module}.plan_case", failing_for("anna"))
+    options = ["--page", str(tmp_path / "page.html")] if command == "overview" else []
+    assert main([command, str(tmp_path / "batch"), "--pipeline", str(pipeline), *options]) == 1
+    out, err = capsys.readouterr()
+    assert "the abacus broke" in err and "bert" in out + err + "".join(
+        path.read_text() for path in tmp_path.glob("page.html"))
+    if command == "run":
+        log = tmp_path / "batch" / "anna" / "work" / "workflow.log"
+        assert "Traceback" in log.read_text() and str(log) in err and "Traceback" not in err
+        assert (tmp_path / "batch" / "bert" / "export" / "page.txt").is_file()
+        states = {one["subject"]: one["state"] for one in
+                  json.loads((tmp_path / "batch" / "summary.json").read_text())["subjects"]}
+        assert states == {"anna": "failed", "bert": "done"}
+    else:
+        assert "Traceback" in err
+
+
+def failing_for(name):
+    """plan_case that fails on the subject of that name."""
+    def plan(pipeline, case, *arguments, **options):
+        if case.name == name:
+            raise ZeroDivisionError("the abacus broke")
+        return plan_case(pipeline, case, *arguments, **options)
+
+    return plan
+
+
+@pytest.mark.parametrize("known", ["[" * 100_000, '{"a": [1e999, 0, 0, 7]}', '{"a": 3, "b": [1, 2, 3]}', "NaN"])
+def test_remembered_hashes_are_checked(tmp_path, known):
+    (tmp_path / "hashes").write_text(known)
+    (tmp_path / "a").write_text("a")
+    memory = HashMemory(tmp_path / "hashes")
+    assert memory.hash(tmp_path / "a") == hash_file(tmp_path / "a")
+    memory.save()
+    assert list(json.loads((tmp_path / "hashes").read_text())) == ["a"]
+
+
+def test_clips_of_a_planted_record_are_those_of_the_subject(tmp_path):
+    run = RunFolder(tmp_path / "anna")
+    (run.work / "clips" / "sun").mkdir(parents=True)
+    (run.work / "inverse_render").mkdir()
+    for clips, names in (([{"name": "../../../victim"}, {"name": "sun"}, 3, {"name": []}], ["sun"]), (7, ["anna"])):
+        (run.work / "inverse_render" / "solve.json").write_text(json.dumps({"clips": clips}))
+        assert [clip.root.name for clip in clips_of(run)] == names
+
+
+def test_check_shows_no_control_codes_and_no_traces(tmp_path, capsys):
+    (tmp_path / "export").mkdir()
+    (tmp_path / "export" / "SHA256SUMS").write_text("0" * 64 + "  a\n")
+    (tmp_path / "export" / "\x1b[2J").write_text("x")
+    assert main(["check", str(tmp_path)]) == 2
+    shown = capsys.readouterr()
+    assert "\x1b" not in shown.out + shown.err and "not checked" in shown.out

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import sys
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,7 +13,7 @@ from shared.contract.declare import Stage
 from shared.contract.folders import RunFolder
 from shared.contract.pipeline import Pipeline, split_settings
 from shared.contract.subject import Subject, load_subject
-from shared.errors import InputError
+from shared.errors import InputError, shown
 
 LARGEST_LIST_BYTES = 1 << 24
 
@@ -56,16 +59,46 @@ class Case:
 
 @dataclass(frozen=True)
 class Opened:
-    """The subjects of a call. faults: (folder, what is wrong) of those that cannot be worked on."""
+    """The subjects of a call. faults: (folder, what is wrong) of those that cannot be worked on. crashes: the same of
+    those on which Limn itself failed."""
 
     cases: list[Case] = field(default_factory=list)
     faults: list[tuple[Path, InputError]] = field(default_factory=list)
+    crashes: list[tuple[Path, str]] = field(default_factory=list)
 
-    def all(self) -> list[Case]:
-        """All subjects; InputErrors where one is at fault."""
-        if self.faults:
-            raise InputErrors([error for _, error in self.faults])
-        return self.cases
+    @contextlib.contextmanager
+    def attempt(self, case: Case) -> Iterator[None]:
+        """What goes wrong with one subject is kept for conclude(), so that it stops no other; traces go to stderr."""
+        try:
+            yield
+        except InputError as error:
+            self.faults.append((case.subject.folder, error))
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            self.faults.append((case.subject.folder, no_access(case, error)))
+        except Exception as error:  # a bug, or a planted record that gets past the checks: never hidden
+            traceback.print_exc()
+            self.crashes.append((case.subject.folder, one_line(error)))
+
+    def conclude(self) -> int:
+        """Says what is wrong with which subjects; returns the exit code."""
+        for _, error in self.faults:
+            print(f"limn: {error}", file=sys.stderr)
+        for folder, text in self.crashes:
+            print(f"limn: {folder}: failed: {text}", file=sys.stderr)
+        return 1 if self.crashes else 2 if self.faults else 0
+
+
+def no_access(case: Case, error: OSError) -> InputError:
+    """What to say where the subject's files cannot be read or written."""
+    return InputError("cannot be read or written", where=str(error.filename or case.run.root), got=error.strerror,
+                      mend="check permissions and disk, or write elsewhere with --out DIR")
+
+
+def one_line(error: Exception) -> str:
+    """An unexpected error in one line."""
+    return shown(f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
 def find_subjects(folders: Sequence[Path], list_file: Path | None = None) -> list[Path]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from shared.contract.hashing import hash_file
 from shared.contract.sums import SUMS, faults_of, files_below, read_sums
-from shared.errors import InputError
+from shared.errors import InputError, shown
 from tools.cases import InputErrors
 
 _SHOWN = 5
@@ -32,8 +32,8 @@ def find_exports(folder: Path) -> list[Path]:
     """The folder itself where it holds a list of hashes, its export/, or those of the subjects in it."""
     if not folder.is_dir():
         raise InputError("no such folder", where=str(folder))
-    near = [path for path in (folder, folder / "export") if (path / SUMS).is_file()]
     try:
+        near = [path for path in (folder, folder / "export") if (path / SUMS).is_file()]
         return near[:1] or [path.parent for path in sorted(folder.glob(f"*/export/{SUMS}"))] or [folder]
     except OSError as error:
         raise InputError("cannot be read", where=str(error.filename or folder), got=error.strerror) from error
@@ -43,12 +43,15 @@ def _check(export: Path) -> tuple[list[str], list[InputError]]:
     """What to say of an export, and what is wrong with it."""
     try:
         sums = read_sums(export)
+        errors = list(faults_of(export, sums))
     except InputError as error:
         return [], [error]
-    errors = list(faults_of(export, sums))
+    except OSError as error:
+        return [], [InputError("cannot be read", where=str(error.filename or export), got=error.strerror)]
     more = sorted(set(files_below(export)) - {*sums, SUMS})
-    shown = ", ".join(more[:_SHOWN]) + (f" and {len(more) - _SHOWN} more" if len(more) > _SHOWN else "")
-    lines = [f"{export}: not published with it, not checked: {shown}"] if more else []
+    named = ", ".join(name if name.isprintable() else shown(name) for name in more[:_SHOWN])
+    named += f" and {len(more) - _SHOWN} more" if len(more) > _SHOWN else ""
+    lines = [f"{export}: not published with it, not checked: {named}"] if more else []
     if not errors:
         lines.append(f"{export}: {len(sums)} files are as published; SHA-256 of {SUMS}: {hash_file(export / SUMS)}")
     return lines, errors

@@ -82,7 +82,10 @@ def tracking_records(run: RunFolder) -> list[tuple[dict, RunFolder]]:
 def clips_of(run: RunFolder) -> list[RunFolder]:
     """The folders of the clips that the result was solved from, in order; the run itself where there is but one."""
     solved = read_record(run.published("inverse_render") / "solve.json") or {}
-    return [run.of_clip(clip["name"]) for clip in solved.get("clips", ())] or [run]
+    clips = solved.get("clips")
+    names = [clip.get("name") for clip in clips if isinstance(clip, dict)] if isinstance(clips, list) else []
+    own = {clip.root.name: clip for clip in run.clips()}
+    return [own[name] for name in names if isinstance(name, str) and name in own] or [run]
 
 
 def held_out_residual(run: RunFolder) -> float | None:

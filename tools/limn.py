@@ -227,21 +227,26 @@ def overview_command(args: argparse.Namespace) -> int:
     pipeline = load_pipeline(args.pipeline)
     parameters = all_parameters(pipeline, args.preset, args.set)
     opened = open_cases(find_subjects(args.subjects, args.list), args.out)
-    outcomes = [at_fault(folder, error) for folder, error in opened.faults]
-    outcomes += [outcome_now(case, pipeline, plan_case(pipeline, case, parameters)) for case in opened.cases]
+    outcomes = []
+    for case in opened.cases:
+        with opened.attempt(case):
+            outcomes.append(outcome_now(case, pipeline, plan_case(pipeline, case, parameters)))
+    outcomes += [at_fault(folder, error) for folder, error in opened.faults]
+    outcomes += [at_fault(folder, text, "failed") for folder, text in opened.crashes]
     write_overview(args.page, outcomes, pipeline)
     print(args.page)
-    opened.all()
-    return 0
+    return opened.conclude()
 
 
 def clean_command(args: argparse.Namespace) -> int:
     """limn clean"""
     pipeline = load_pipeline(args.pipeline)
-    for case in open_cases(find_subjects(args.subjects, args.list), args.out).all():
-        for line in clean(case.run, pipeline, args.dry_run):
-            print(line, flush=True)
-    return 0
+    opened = open_cases(find_subjects(args.subjects, args.list), args.out)
+    for case in opened.cases:
+        with opened.attempt(case):
+            for line in clean(case.run, pipeline, args.dry_run):
+                print(line, flush=True)
+    return opened.conclude()
 
 
 def new_command(args: argparse.Namespace) -> int:
@@ -286,16 +291,10 @@ def _for_each_plan(args: argparse.Namespace, show) -> int:
     parameters = all_parameters(pipeline, args.preset, args.set)
     opened = open_cases(find_subjects(args.subjects, args.list), args.out)
     for case in opened.cases:
-        try:
+        with opened.attempt(case):
             show(case, plan_case(pipeline, case, parameters, getattr(args, "verify", False),
                                  getattr(args, "renew", False)))
-        except InputError as error:
-            opened.faults.append((case.subject.folder, error))
-        except OSError as error:
-            fault = InputError("cannot be read", where=str(error.filename or case.run.root), got=error.strerror)
-            opened.faults.append((case.subject.folder, fault))
-    opened.all()
-    return 0
+    return opened.conclude()
 
 
 if __name__ == "__main__":

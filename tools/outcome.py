@@ -51,10 +51,10 @@ def exit_code(outcomes: Sequence[Outcome]) -> int:
     return next((code for code in (1, 2, 3) if code in codes), 0)
 
 
-def at_fault(folder: Path, error: InputError) -> Outcome:
-    """A subject that could not be started."""
+def at_fault(folder: Path, error: InputError | str, state: str = "input error", log: str = "") -> Outcome:
+    """A subject that could not be started, or on which Limn itself failed."""
     name = os.fsencode(Path(os.path.abspath(folder)).name).decode(errors="replace")
-    return Outcome(name, str(folder), "input error", reason=str(error))
+    return Outcome(name, str(folder), state, reason=str(error), log=log)
 
 
 def outcome_of(case: Case, pipeline: Pipeline, plans: Mapping[str, StagePlan], tracks: Sequence[Track] = (),

@@ -15,9 +15,10 @@ from shared.contract.manifest import read_record
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
 from tools.cases import Case
-from tools.gates import RECORD, Flag
+from tools.gates import RECORD, read_flags
 from tools.outcome import Outcome, costs_of
 from tools.plan import CURRENT, StagePlan
+from tools.records import number_of
 from tools.summary import ORDER
 
 TEMPLATE = Path(__file__).with_name("overview_page.html")
@@ -31,7 +32,7 @@ def outcome_now(case: Case, pipeline: Pipeline, plans: Mapping[str, StagePlan]) 
     left = [name for name, plan in plans.items() if plan.state != CURRENT]
     if left:
         return Outcome(state="not run", stage=left[0], reason="; ".join(plans[left[0]].reasons), **facts)
-    flags = tuple(flags_of(case.run))
+    flags = tuple(read_flags(case.run))
     return Outcome(state="review" if flags else "done", stage=list(plans)[-1], flags=flags,
                    reason="; ".join(map(str, flags)), **facts)
 
@@ -39,24 +40,8 @@ def outcome_now(case: Case, pipeline: Pipeline, plans: Mapping[str, StagePlan]) 
 def values_of(run: RunFolder) -> dict[str, float]:
     """{gate: value} as they were judged; without what is no number."""
     values = (read_record(run.work / RECORD) or {}).get("values")
-    return {str(name): float(value) for name, value in values.items() if _is_number(value)} if isinstance(
+    return {name: float(values[name]) for name in values if number_of(values, name) is not None} if isinstance(
         values, dict) else {}
-
-
-def flags_of(run: RunFolder) -> list[Flag]:
-    """The gates that the result was found to miss."""
-    flags = (read_record(run.work / RECORD) or {}).get("flags")
-    return [Flag(flag["gate"], float(flag["value"]), flag["limit"]) for flag in flags if _is_flag(flag)] if isinstance(
-        flags, list) else []
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
-
-
-def _is_flag(flag: object) -> bool:
-    return isinstance(flag, dict) and isinstance(flag.get("gate"), str) and isinstance(
-        flag.get("limit"), str) and _is_number(flag.get("value"))
 
 
 def write_overview(path: Path, outcomes: Sequence[Outcome], pipeline: Pipeline) -> None:

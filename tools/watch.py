@@ -53,7 +53,7 @@ class Track:
         self.read_to += len(whole)
         events = []
         for line in whole.splitlines():
-            with contextlib.suppress(ValueError):  # a line that a full disk cut
+            with contextlib.suppress(ValueError, RecursionError):  # a line that a full disk cut
                 events.append(json.loads(line))
         return [event for event in events if isinstance(event, dict) and is_event(event)]
 

@@ -12,15 +12,17 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Mapping, Sequence
+import traceback
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 from shared.contract.folders import RunFolder
 from shared.contract.manifest import LOG, MANIFEST
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
-from tools.cases import Case, InputErrors, Opened
+from tools.cases import Case, InputErrors, Opened, no_access, one_line
 from tools.cluster import keep_slurm_logs
 from tools.engine import SCRATCH, Settings, configure, run_engine, scratch_folder
 from tools.outcome import Outcome, at_fault, exit_code, outcome_of, write_summary
@@ -38,7 +40,7 @@ def run_cases(opened: Opened, settings: Settings) -> int:
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _interrupt)
     start, started = time.monotonic(), datetime.now(UTC).isoformat(timespec="seconds")
-    faults = list(opened.faults)
+    faults, crashed = list(opened.faults), []
     with contextlib.ExitStack() as stack:
         planned: list[tuple[Case, dict[str, StagePlan]]] = []
         for case in opened.cases:
@@ -46,7 +48,9 @@ def run_cases(opened: Opened, settings: Settings) -> int:
                 planned.append((case, _begin(stack, case, settings)))
             except InputError as error:
                 faults.append((case.subject.folder, error))
-        if not planned:
+            except Exception as error:  # of one subject; it must not stop the others
+                crashed.append(_crash(case, error))
+        if not planned and not crashed:
             raise InputErrors([error for _, error in faults])
         for _, error in faults:
             _say(f"limn: {error}")
@@ -56,8 +60,9 @@ def run_cases(opened: Opened, settings: Settings) -> int:
                 _say(f"{case.name}: current, nothing to do: {case.run.root}")
                 _say_kept(case, plan)
         ended = _run_waiting(waiting, settings, start) if waiting else {}
-        outcomes = [at_fault(folder, error) for folder, error in faults]
-        outcomes += [ended.get(case.name) or outcome_of(case, settings.pipeline, plan) for case, plan in planned]
+        outcomes = [at_fault(folder, error) for folder, error in faults] + crashed
+        outcomes += [ended.get(case.name) or _guarded(case, partial(outcome_of, case, settings.pipeline, plan))
+                     for case, plan in planned]
     return _finish(outcomes, settings, started, time.monotonic() - start)
 
 
@@ -87,9 +92,7 @@ def _begin(stack: contextlib.ExitStack, case: Case, settings: Settings) -> dict[
             plan = plan_case(settings.pipeline, case, settings.parameters, renew=settings.renew)
             _renew_stamps(plan)
         except OSError as error:
-            raise InputError("cannot be read or written", where=str(error.filename or case.run.root),
-                             got=error.strerror, mend="check permissions and disk, or write elsewhere with --out DIR"
-                             ) from error
+            raise no_access(case, error) from error
         stack.push(own.pop_all())
     return plan
 
@@ -146,8 +149,37 @@ def _run_waiting(cases: Sequence[Case], settings: Settings, start: float) -> dic
         if not interrupted and all(track.state == "waiting" for track in watch.tracks):
             for line in log.read_text(encoding="utf-8", errors="replace").splitlines()[-20:]:
                 _say(f"| {line}")
-        return {case.name: _conclude(case, own, settings, log, time.monotonic() - start, interrupted)
+        return {case.name: _guarded(case, partial(_conclude, case, own, settings, log, time.monotonic() - start,
+                                                  interrupted))
                 for case, own in zip(cases, tracks, strict=True)}
+
+
+def _guarded(case: Case, judged: Callable[[], Outcome]) -> Outcome:
+    """The outcome of one subject, whatever its records do to us on the way: that is its own, and stops no other."""
+    try:
+        return judged()
+    except InputError as error:
+        fault = error
+    except OSError as error:
+        fault = no_access(case, error)
+    except Exception as error:
+        return _crash(case, error)
+    _say(f"limn: {fault}")
+    return at_fault(case.subject.folder, fault)
+
+
+def _crash(case: Case, error: Exception) -> Outcome:
+    """A subject on which we failed: the trace goes to its log, or to stderr where that cannot be written."""
+    log, text = case.run.work / _WORKFLOW_LOG, "".join(traceback.format_exception(error))
+    try:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with open(log, "a", encoding="utf-8", errors="replace") as file:
+            file.write(text)
+    except OSError:
+        log = None
+        _say(text)
+    _say(f"{case.name}: failed: {one_line(error)}" + (f"; its log: {log}" if log else ""))
+    return at_fault(case.subject.folder, one_line(error), "failed", str(log or ""))
 
 
 def _conclude(case: Case, tracks: Sequence[Track], settings: Settings, log: Path, seconds: float,
@@ -209,20 +241,22 @@ def default_summary(subjects: Sequence[Path], out: Path | None, given: Path | No
                     results: Sequence[Path] = ()) -> Path | None:
     """Where summary.json goes: as told, else to --out, else into the one folder of subjects that was given.
 
-    Where a folder has that name, or one of the results will, it is called summary-2.json, and a line says so.
-    InputError where a folder was told.
+    Where a folder has that name or that of the page beside it, or one of the results will, it is called summary-2.json,
+    and a line says so. InputError where a folder was told.
     """
     if given is not None:
-        if given.is_dir():
-            raise InputError("a folder, not a file", where="--summary", got=given, expected="a file's name")
+        for path in (given, page_beside(given)):
+            if path.is_dir():
+                raise InputError("a folder, not a file", where="--summary", got=path, expected="a file's name")
         return given
     if out is None and (len(subjects) != 1 or (subjects[0] / "subject.yaml").exists()):
         return None
     folder = Path(os.path.abspath(subjects[0] if out is None else out))
-    names = ["summary.json", *(f"summary-{i}.json" for i in range(2, len(results) + 3))]
-    free = [folder / name for name in names if folder / name not in results and not (folder / name).is_dir()]
+    names = ["summary.json", *(f"summary-{i}.json" for i in range(2, 2 * len(results) + 3))]
+    free = [folder / name for name in names
+            if all(path not in results and not path.is_dir() for path in (folder / name, page_beside(folder / name)))]
     if not free:
         raise InputError("no free name for the summary", where=str(folder), mend="name a place with --summary FILE")
     if free[0].name != names[0]:
-        _say(f"limn: {folder / names[0]} is a folder: the summary goes to {free[0]}")
+        _say(f"limn: {folder / names[0]}, or the page beside it, is a folder: the summary goes to {free[0]}")
     return free[0]

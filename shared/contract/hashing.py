@@ -41,15 +41,16 @@ class HashMemory:
         """verify: read every file again, whatever is remembered."""
         self.path, self.verify, self._changed = path, verify, False
         self._known: dict[str, list] = {}
-        with contextlib.suppress(OSError, ValueError):
+        with contextlib.suppress(OSError, ValueError, RecursionError):
             known = json.loads(path.read_text(encoding="utf-8"))
-            self._known = known if isinstance(known, dict) else {}
+            self._known = {key: entry for key, entry in known.items() if _is_entry(entry)} if isinstance(
+                known, dict) else {}
 
     def hash(self, path: Path) -> str:
         """SHA-256 of the file's content."""
         key, state = self._key(path), _state(path)
         known = self._known.get(key)
-        if not self.verify and isinstance(known, list) and known[:-1] == state:
+        if not self.verify and known is not None and known[:-1] == state:
             return known[-1]
         digest = hash_file(path)
         self._known[key], self._changed = [*state, digest], True
@@ -70,6 +71,12 @@ class HashMemory:
 
     def _key(self, path: Path) -> str:
         return os.path.relpath(path, self.path.parent)
+
+
+def _is_entry(entry: object) -> bool:
+    """Whether it is what save() writes: the file's state and its hash."""
+    return isinstance(entry, list) and len(entry) == 4 and isinstance(entry[3], str) and all(
+        type(value) is int for value in entry[:3])
 
 
 def _state(path: Path) -> list[int]:
