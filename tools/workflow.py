@@ -245,9 +245,8 @@ def default_summary(subjects: Sequence[Path], out: Path | None, given: Path | No
     and a line says so. InputError where a folder was told.
     """
     if given is not None:
-        for path in (given, page_beside(given)):
-            if path.is_dir():
-                raise InputError("a folder, not a file", where="--summary", got=path, expected="a file's name")
+        if given.is_dir():
+            raise InputError("a folder, not a file", where="--summary", got=given, expected="a file's name")
         return given
     if out is None and (len(subjects) != 1 or (subjects[0] / "subject.yaml").exists()):
         return None
