@@ -82,9 +82,10 @@ def spread_vertices(vertices: np.ndarray, count: int, allowed: np.ndarray | None
     """Indices of at most count vertices, spread evenly over the area: one per occupied cell of a voxel grid.
 
     vertices [V, 3]; allowed [V] bool or None. The cells are the smallest of a ladder of sizes that no more than count
-    of are occupied; within a cell the vertex nearest to the cell's mean wins, of equally near ones the first: two in a
-    cell always are. Sizes found by bisection would end where a vertex crosses from one cell to the next, so that a
-    vertex that moved by a rounding would change all the others.
+    of are occupied; within a cell the vertex nearest to the cell's mean wins. Of equally near ones, as two in a cell
+    always are, one is drawn by its number (Knuth's multiplicative hash): the first would be one that a subdivision
+    started from, and never one that it added. Sizes found by bisection would end where a vertex crosses from one cell
+    to the next, so that a vertex that moved by a rounding would change all the others.
     """
     candidates = np.arange(len(vertices)) if allowed is None else np.nonzero(allowed)[0]
     if len(candidates) <= count:
@@ -102,7 +103,8 @@ def spread_vertices(vertices: np.ndarray, count: int, allowed: np.ndarray | None
     size = np.bincount(inverse)
     mean = np.stack([np.bincount(inverse, points[:, k]) / size for k in range(3)], axis=1)
     distance = np.rint(((points - mean[inverse]) ** 2).sum(1) / (1e-3 * edge) ** 2)
-    order = np.lexsort((np.arange(len(points)), distance, inverse))
+    drawn = np.arange(len(points), dtype=np.uint64) * np.uint64(2654435761) % np.uint64(1 << 32)
+    order = np.lexsort((drawn, distance, inverse))
     first = np.searchsorted(inverse[order], np.arange(len(cells)))
     return np.sort(candidates[order[first]])
 

@@ -19,6 +19,7 @@ FRAMES = {"source": {"name": "clip.mp4", "width": 1920, "height": 1080, "fps": 2
 TRACKING = {"tracks": 5000, "frames": 47, "reprojection_px": {"median": 0.1, "p95": 0.3}, "rotation_range_deg": 61.2}
 SOLVE = {"residuals": {"fitted": 0.0123, "held_out": 0.0145}, "held_out_frames": [1, 9], "shape": {"refined": True},
          "albedo_scale": {"method": "priors: skin's luminance"}}
+SAMPLE_FRAMES = f"sample_frames {load_pipeline().stages['sample_frames'].version}"
 PACKAGES = {"limn": "0.1.0", "numpy": "2.4.6", "torch": "2.13.0+cpu", "av": "18.1.0", "usd-core": "26.11"}
 
 
@@ -39,7 +40,7 @@ def flat(text):
 
 def test_figures_and_versions_are_those_of_the_run():
     text = flat(methods_text(records()))
-    for part in ("Limn 0.1.0", "sample_frames 3", "NumPy 2.4.6", "PyTorch 2.13.0+cpu", "PyAV 18.1.0", "OpenUSD 26.11",
+    for part in ("Limn 0.1.0", SAMPLE_FRAMES, "NumPy 2.4.6", "PyTorch 2.13.0+cpu", "PyAV 18.1.0", "OpenUSD 26.11",
                  "1920 x 1080 px, 25 frames/s", "48 frames", "focal length 5166 px, given", "3 were left out",
                  "5000 points in 47 frames", "0.10 px (95 %: 0.30 px)", "turn of 61 degrees", "fitted frames by 0.0123",
                  "2 frames held out of the solve by 0.0145", "priors: skin's luminance", "scene-linear Rec.709"):
@@ -85,7 +86,7 @@ def test_every_reference_is_of_use():
 def test_several_clips_are_told_one_by_one():
     text = flat(methods_text(records(clips=("sun", "lamp"))))
     assert "Of the clip sun (1920" in text and "Of the clip lamp 5000 points" in text
-    assert "place the clips on one mesh" in text and text.count("sample_frames 3") == 1
+    assert "place the clips on one mesh" in text and text.count(SAMPLE_FRAMES) == 1
 
 
 def test_braces_in_records_are_text():

@@ -69,8 +69,12 @@ def test_rows_say_what_became_of_each_subject_the_worst_first(page):
     rows = rows_of(text)
     assert list(rows) == ["failed", "input-error", "review", "done"] and "4 subjects" in text
     assert "1 done, 1 review, 1 input error, 1 failed" in text
-    assert rows["failed"][3] == "inverse_render: the abacus broke" and rows["failed"][4:8] == ["-"] * 4
-    assert rows["review"][4:8] == ["0.1", "0.5", "0.9", "0.8"] and rows["done"][11] == "5.0 MB"
+    gates = list(load_pipeline().gates)
+    measured = {"reprojection_px": "0.1", "held_out_residual": "0.5", "coverage": "0.9", "confidence": "0.8"}
+    assert rows["failed"][3] == "inverse_render: the abacus broke"
+    assert rows["failed"][4 : 4 + len(gates)] == ["-"] * len(gates)
+    assert rows["review"][4 : 4 + len(gates)] == [measured.get(name, "-") for name in gates]
+    assert rows["done"][7 + len(gates)] == "5.0 MB"
     assert 'class="missed" data-key="0.5"' in text and text.count('class="missed"') == 1
     assert "<small>0.035 or less</small>" in text
 

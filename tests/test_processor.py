@@ -9,17 +9,17 @@ from shared.geometry import rigid, rotation_from_vector
 from shared.landmarks import _warped
 from shared.processor import use_baseline_opencv
 from shared.solve.first_poses import choose_references
-from shared.solve.light import LightPriors
-from shared.solve.light_models import make_light_model
-from shared.solve.light_step import conjugate_gradients
 from shared.tracks import local_contrast
 from shared.transfer import spread_vertices
 
 
 @pytest.fixture
 def optimised():
-    yield
+    """As OpenCV is loaded, whatever stage ran in this process before."""
+    before = cv2.useOptimized()
     cv2.setUseOptimized(True)
+    yield
+    cv2.setUseOptimized(before)
 
 
 def test_opencv_leaves_the_processors_own_code(optimised):
@@ -72,37 +72,3 @@ def test_contrast_takes_each_codes_logarithm_from_a_table_of_doubles():
     spread = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), 5.0)) + 0.02
     expected = np.clip(np.rint(detail / spread * 45.0 + 128.0), 0, 255)
     assert np.array_equal(local_contrast(grey, 3.0, 5.0, 0.02), expected)
-
-
-def test_a_light_steps_preconditioner_is_near_the_inverse_of_its_prior():
-    """It is symmetric and positive, channels apart, and with it fewer products serve."""
-    model, rng = make_light_model("cubemap", 4), np.random.default_rng(3)
-    params, priors = 0.5 * rng.normal(size=(96, 3)), LightPriors(smooth=3.0, white=2.0)
-    solve = model.preconditioner(params, priors)
-    a, b = rng.normal(size=(2, 96, 3))
-    assert np.isclose((a * solve(b)).sum(), (b * solve(a)).sum())
-    assert (a * solve(a)).sum() > 0.0
-    alone = np.zeros((96, 3))
-    alone[:, 1] = a[:, 1]
-    assert np.allclose(solve(a)[:, 1], solve(alone)[:, 1]) and not solve(alone)[:, [0, 2]].any()
-    prior = model.prior(params, priors)[2]
-    rows = rng.normal(size=(5, 288))
-
-    def product(x):
-        return prior(x) + x + (rows.T @ (rows @ x.ravel())).reshape(x.shape)
-
-    exact = conjugate_gradients(product, a, 400, 1e-12)
-    plain, helped = (conjugate_gradients(product, a, 10, 0.0, *how) for how in ((), (solve,)))
-    assert np.linalg.norm(helped - exact) < 0.2 * np.linalg.norm(plain - exact)
-
-
-def test_lights_of_few_numbers_and_several_lights_are_preconditioned_too():
-    rng, priors = np.random.default_rng(4), LightPriors()
-    few = make_light_model("harmonics_2", 4)
-    right = rng.normal(size=(9, 3))
-    assert np.array_equal(few.preconditioner(np.zeros((9, 3)), priors)(right), right)
-    several, one = make_light_model("cubemap", 4, lights=2), make_light_model("cubemap", 4)
-    params, right = rng.normal(size=(2, 192, 3))
-    own = [one.preconditioner(part, priors)(part_right) for part, part_right in
-           zip(np.split(params, 2), np.split(right, 2), strict=True)]
-    assert np.allclose(several.preconditioner(params, priors)(right), np.concatenate(own))

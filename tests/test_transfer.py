@@ -190,3 +190,11 @@ def test_the_two_sides_of_a_thin_part_stay_apart():
     sides = Points(np.array([[0.0, 0, -1], [10.0, 0, 0]]), np.array([[0.0, 0, -1], [0.0, 0, 1]]))
     target = Points(np.array([[0.0, 0, 0]]), np.array([[0.0, 0, 1.0]]))
     assert nearest_points(target, sides)[0] == 1
+
+
+def test_spread_vertices_are_not_those_of_the_mesh_before_its_subdivision():
+    """Of two vertices in a cell, equally near to their mean, neither the older nor the newer one wins as a rule."""
+    ball = sphere(levels=5)
+    before = len(ball.vertices) // 4
+    index = spread_vertices(ball.vertices, len(ball.vertices) // 2)
+    assert 0.15 < (index < before).mean() < 0.5

@@ -10,13 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sparse
-from scipy.sparse.linalg import splu
 
 from shared.envmap import cube_directions, cube_lookup, cube_smoothness, cube_solid_angles, frame_lookup
-
-DATA_CURVATURE = 1.0
-"""By a texel's log radiance, of what the samples say at least: where they say much more, products tell it."""
 
 
 @dataclass(frozen=True)
@@ -81,25 +76,6 @@ class LogPrior:
 
         cost = priors.smooth * priors.edge**2 * float((root - 1.0).sum()) + 0.5 * float((white * chroma**2).sum())
         return cost, self._differences.T @ (weight * step) + white * chroma, product
-
-
-    def preconditioner(self, log_light: np.ndarray, priors: LightPriors) -> Callable:
-        """Approximate inverse of the Hessian of prior and data: [K, C] -> [K, C], channels by themselves.
-
-        The prior's own Hessian, with DATA_CURVATURE for what samples say of every texel.
-        """
-        weight = priors.smooth / np.sqrt(1.0 + (self._differences @ log_light / priors.edge) ** 2)
-        diagonal = sparse.diags(DATA_CURVATURE + priors.white * self._solid * (1.0 - 1.0 / log_light.shape[1]))
-        factors = [
-            splu(
-                (self._differences.T @ sparse.diags(of_channel) @ self._differences + diagonal).tocsc(),
-                permc_spec="MMD_AT_PLUS_A",
-                diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True},
-            )
-            for of_channel in weight.T
-        ]
-        return lambda right: np.stack([f.solve(r) for f, r in zip(factors, right.T, strict=True)], axis=1)
 
 
 def resample_light(light: np.ndarray, resolution: int) -> np.ndarray:

@@ -86,10 +86,6 @@ class LogLight:
         cost, gradient, product = self.log_prior(self._log(params), priors)
         return cost, self._log_adjoint(gradient), lambda change: self._log_adjoint(product(self._log(change)))
 
-    def preconditioner(self, params: np.ndarray, priors: LightPriors) -> Callable:
-        """Approximate inverse of a step's Hessian, [M, 3] -> [M, 3]: of a cubemap's texels; few numbers need none."""
-        return _unchanged if self.basis is not None else self.log_prior.preconditioner(params, priors)
-
     def fit(self, radiance: np.ndarray) -> np.ndarray:
         """Parameters whose light comes closest to a cubemap of any resolution, in the logarithm -> [M, 3]."""
         log_light = np.log(resample_light(radiance, self.resolution))
@@ -166,10 +162,6 @@ class LampLight:
 
         return cost + 0.5 * float((away * (lamp - lamp.mean())).sum()), result, whole
 
-    def preconditioner(self, params: np.ndarray, priors: LightPriors) -> Callable:
-        """As of LogLight: the numbers are few."""
-        return _unchanged
-
     def fit(self, radiance: np.ndarray) -> np.ndarray:
         """The lamp takes what exceeds the median of a cubemap around its brightest direction, the sky the rest."""
         fine = resample_light(radiance, self.resolution)
@@ -235,26 +227,12 @@ class SeveralLights:
     def _weighted(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         return np.concatenate([share * part for share, part in zip(self.shares, parts, strict=True)])
 
-    def preconditioner(self, params: np.ndarray, priors: LightPriors) -> Callable:
-        """As of LogLight, each light by itself."""
-        each = [self.model.preconditioner(own, priors) for own in np.split(params, self.count)]
-
-        def solve(right: np.ndarray) -> np.ndarray:
-            parts = zip(each, self.shares, np.split(right, self.count), strict=True)
-            return np.concatenate([of_one(part) / share for of_one, share, part in parts])
-
-        return solve
-
     def fit(self, radiance: np.ndarray) -> np.ndarray:
         """Parameters whose lights come closest to cubemaps of any resolution, one below the other -> [L M, 3]."""
         return self._each(self.model.fit, radiance)
 
 
 LightModel = LogLight | LampLight | SeveralLights
-
-
-def _unchanged(right: np.ndarray) -> np.ndarray:
-    return right
 
 
 def make_light_model(name: str, resolution: int, lights: int = 1) -> LightModel:

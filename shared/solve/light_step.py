@@ -37,21 +37,16 @@ are what the samples tell least of, and come last: steps that stop before leave 
 
 
 def conjugate_gradients(
-    product: Callable,
-    right: np.ndarray,
-    count: int,
-    tolerance: float = 0.02,
-    precondition: Callable = lambda residual: residual,
+    product: Callable, right: np.ndarray, count: int, tolerance: float = 0.02
 ) -> np.ndarray:
     """Approximate solution of product(x) = right by conjugate gradients, at most count products.
 
-    precondition: an approximate inverse of product, symmetric and positive. Ends when the residual has fallen by the
-    tolerance in the norm that this inverse gives. Ended long before, what remains hangs on roundings: products in
-    single precision then come out as 1e-7 in and 1e-2 out.
+    Ends when the residual has fallen by the tolerance. Ended long before, what remains hangs on roundings: 1e-7 in
+    products of single precision comes out as 1e-2.
     """
     x, residual = np.zeros_like(right), right.copy()
-    direction = precondition(residual)
-    power = first = float((residual * direction).sum())
+    direction, power = residual.copy(), float((residual * residual).sum())
+    first = power
     for _ in range(count):
         image = product(direction)
         curvature = float((direction * image).sum())
@@ -60,11 +55,10 @@ def conjugate_gradients(
         length = power / curvature
         x += length * direction
         residual -= length * image
-        towards = precondition(residual)
-        power, last = float((residual * towards).sum()), power
+        power, last = float((residual * residual).sum()), power
         if power <= tolerance**2 * first:
             break
-        direction = towards + (power / last) * direction
+        direction = residual + (power / last) * direction
     return x
 
 
@@ -249,11 +243,7 @@ class LightStep:
         several = len(self.solver.light_frames) > 1
         count, tolerance = PRECISION_OF_SEVERAL if several else self.solver.settings.precision
         solved = conjugate_gradients(
-            lambda x: level_transposed(self.product(level(x))),
-            right,
-            count,
-            tolerance,
-            self.model.preconditioner(state.params, self.solver.settings.priors),
+            lambda x: level_transposed(self.product(level(x))), right, count, tolerance
         )
         whole = level(solved)
         longest = max(whole.max() / _LARGEST_RISE, -whole.min() / _LARGEST_FALL, 1.0)

@@ -120,7 +120,7 @@ def _inverse_render(folder: Path) -> Measures:
     skin = np.unique(arrays["faces"][arrays["face_segment"] < len(_SKIN)])
     model, residuals = facts["model"], facts["residuals"]
     renders = [read_exr(path) for path in sorted((folder / "renders").glob("*.exr"))]
-    return _light(folder / "envmap.exr") | _maps(folder / "maps", "") | _poses(poses, np.full((1, 6), 0.01)) | {
+    return _light(folder / "envmap.exr") | _maps(folder / "maps", "") | _poses(poses, np.full((1, 6), 0.1)) | {
         "frames held out": _same(*facts["held_out_frames"]),
         "light model": _same(model["light"]),
         "residuals": _relative([residuals["fitted"], residuals["held_out"]]),
