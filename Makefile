@@ -1,5 +1,6 @@
 # make demo    set-up, then the embedded subject from clip to scores
 # make test    set-up, then the lint and all tests
+# make test-all  installs what the optional tests need (root, Debian), then the lint and all tests in full
 # make test-random  the tests in a random order; SEED=N: that order again
 # make test-files   each test file by itself
 # make setup   the set-up alone
@@ -15,7 +16,7 @@ CASES ?= quick
 OUT ?= build/chart
 SEED ?= $(shell date +%s)
 
-.PHONY: setup demo test test-random test-files chart stress lint audit clean
+.PHONY: setup demo test test-all test-random test-files chart stress lint audit clean
 
 setup: $(STAMP)
 	$(BIN)/python -m tools.check_host
@@ -38,6 +39,9 @@ demo: setup
 
 test: setup lint
 	$(BIN)/python -m pytest
+
+test-all: setup lint
+	$(BIN)/python -m tools.test_all
 
 test-random: setup
 	$(BIN)/python -m pytest --order-seed $(SEED)
