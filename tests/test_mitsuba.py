@@ -65,7 +65,7 @@ def test_highlights_are_theirs(stage):
     """Wide lobes by the sum over directions, narrow ones by the split sum, each to what the benchmark charts."""
     for roughness, limits in ((0.2, {"split": 0.03, "published": 0.05}), (0.45, {"sum": 0.02})):
         coat = Coat((0.0, 0.0, 0.0), 1.0, roughness)
-        theirs, found = stage.truth(coat, DIRECT, 32), {}
+        theirs, found = stage.truth(coat, DIRECT, 128), {}  # 32 leave 1 % of noise in the mean
         for way, limit in limits.items():
             ours = stage.published(coat, 1) if way == "published" else stage.specular(roughness, way == "split")
             found[way] = compare(ours, theirs, stage.filled())["mean"]
