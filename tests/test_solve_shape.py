@@ -1,6 +1,7 @@
 """Shape from shading, parallax and outline on an egg with a dent that the start does not have, and its parts."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from shared.raycast import RayScene, camera_hits
 from shared.shading import Material, VertexShading
 from shared.solve.appearance import Settings
 from shared.solve.capture import Sizes, set_scenery
-from shared.solve.shape import Reflectance, ShapeClip, ShapeSettings, ShapeSolver
+from shared.solve.shape import Reflectance, ShapeClip, ShapeSettings, ShapeSolver, Surface
 from shared.solve.shape_equations import EquationSettings, excess
 from shared.solve.shape_step import TrackPoints, large_step_metric, normal_turns, solve_offsets
 from shared.solve.shape_terms import Reflections, shading_terms
@@ -221,3 +222,30 @@ def test_dent_is_found(toy):
     elsewhere = (wrong < 0.01) & (toy.start.vertices[:, 2] > 40.0)
     assert np.median(np.abs(left[elsewhere])) < 0.1
     np.testing.assert_array_equal(refined.faces, toy.start.faces)
+
+
+@pytest.mark.parametrize("judged, looks_back, kept", [
+    ((1.00, 1.01, 0.80), True, 2),
+    ((1.00, 1.01, 0.80), False, 2),
+    ((1.00, 0.90, 1.20, 1.10), True, 1),
+    ((1.00, 1.20, 1.10, 0.50), True, 0),
+    ((1.00, 1.01, 1.02), False, 0),
+    ((1.00, 0.90, 0.50), False, 2),
+])
+def test_the_shape_goes_on_past_one_worse_step_and_keeps_the_best(toy, monkeypatch, judged, looks_back, kept):
+    """Every step raises the mesh by 1 mm; held-out frames judge it as the list says."""
+    solver = solver_of(toy, subdivisions=0, rounds=len(judged) - 1, looks_back=looks_back)
+    faces = np.ones(len(toy.start.faces), bool)
+
+    def height(mesh):
+        return int(np.rint(((mesh.vertices - toy.start.vertices) * normals).sum(1).mean()))
+
+    def examine(mesh, shaped, traced):
+        value = judged[height(mesh)]
+        equations = SimpleNamespace(judged=value, fitted=value, held_out=value)
+        return Surface(mesh, np.arange(3), np.zeros((3, 2, 3)), equations)
+
+    normals = vertex_normals(toy.start.vertices, toy.start.faces)
+    monkeypatch.setattr(solver, "examine", examine)
+    monkeypatch.setattr(solver, "step", lambda surface, *_: np.ones(len(surface.mesh.vertices)))
+    assert height(solver._refine_level(toy.start, toy.start.vertices, faces, ~faces, 0, None)) == kept

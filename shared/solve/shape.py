@@ -97,6 +97,11 @@ class ShapeClip:
     light_index: np.ndarray | None = None
 
 
+MOST_WORSE = 1
+"""Steps in a row after which held-out frames may fit worse: the first of a finer level often is one by a hair, and the
+next more than makes up for it. The best of all stays."""
+
+
 @dataclass(frozen=True)
 class Surface:
     """A mesh, the vertices index [P] that are shaped, and their equations."""
@@ -257,21 +262,24 @@ class ShapeSolver:
             self.note(f"shape level {level}: too little of the face is seen, the mesh stays")
             return mesh
         self.note(f"shape level {level}: {len(surface.index)} points, {_residuals(surface)}")
+        best, worse = surface, 0
         for number in range(self.settings.rounds):
             offsets = self.step(surface, start, shaped, held)
             normals = vertex_normals(surface.mesh.vertices, surface.mesh.faces)
             vertices = surface.mesh.vertices + offsets[:, None] * normals
-            if number + 1 == self.settings.rounds and not self.settings.looks_back:
+            if number + 1 == self.settings.rounds and not (self.settings.looks_back or worse):
                 return mesh.replace(vertices=vertices)
             moved = self.examine(mesh.replace(vertices=vertices), shaped, traced)
             if moved is None:
                 break
             moves = np.abs(offsets[moved.index])
             self.note(f"  moved {np.median(moves):.3f} mm, 95 % {np.percentile(moves, 95):.3f}: {_residuals(moved)}")
-            if moved.equations.judged > surface.equations.judged:
-                break
             surface = moved
-        return surface.mesh
+            if moved.equations.judged <= best.equations.judged:
+                best, worse = moved, 0
+            elif (worse := worse + 1) > MOST_WORSE:
+                break
+        return best.mesh
 
 
 def typical_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
