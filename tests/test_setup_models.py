@@ -3,14 +3,20 @@
 import json
 import shutil
 import subprocess
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from slow import SLOW
 
 from shared.contract.models import HEAD_MODEL_FILE, models_folder
 from shared.errors import InputError
-from shared.io.models import LIST_FILE, checked_path, load_head_model, network_path
+from shared.io.models import LIST_FILE, checked_path, file_sha256, load_head_model, network_path
 from tools import check_host, setup_models
+from tools.goldens.kernels import LEAST
+from tools.head_model.build import MM_STEP, rounded
+from tools.head_model.embedding import _closest
 from tools.head_model.relaxation import _derivatives, _energy, _rest_gradients, relax
 
 
@@ -135,3 +141,31 @@ class TestRelaxation:
         result = relax(start, rolled, faces, ones, ones, fixed)
         got = np.linalg.norm(result[8] - result[0]) / np.linalg.norm(result[72] - result[0])
         assert got == pytest.approx(width, rel=1e-3)
+
+
+class TestTheSameModelOnEveryProcessor:
+    def test_the_last_digits_of_kernels_are_rounded_away(self):
+        rng = np.random.default_rng(0)
+        lengths = rng.uniform(-150.0, 150.0, (4000, 3))
+        kept = rounded(lengths, MM_STEP)
+        assert np.array_equal(rounded(lengths + 1e-13 * rng.normal(size=lengths.shape), MM_STEP), kept)
+        assert np.abs(kept - lengths).max() <= MM_STEP / 2 and kept.dtype == lengths.dtype
+        assert rounded(lengths.astype(np.float32), MM_STEP).dtype == np.float32
+
+    def test_a_place_on_an_edge_lies_on_the_first_of_its_faces(self):
+        """Two triangles share the edge x = 0, as the faces on both sides of the midline do."""
+        corners = np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0], [-8.0, 5.0, 0.0], [8.0, 5.0, 0.0]])
+        faces = np.array([[0, 1, 2], [1, 0, 3]] + [[0, 1, 2]] * 12)
+        sheet = SimpleNamespace(template=corners, faces=faces)
+        points = np.array([[offset, 4.0, 1.0] for offset in (-1e-13, 0.0, 1e-13)])
+        face, bary = _closest(sheet, np.arange(len(faces)) < 12, points)
+        assert face.tolist() == [0, 0, 0]
+        assert np.allclose((bary[..., None] * corners[faces[face]]).sum(1), [0.0, 4.0, 0.0])
+        assert _closest(sheet, np.arange(len(faces)) < 12, np.array([[0.1, 4.0, 1.0]]))[0].tolist() == [1]
+
+    @pytest.mark.skipif(not SLOW, reason="fetches 84 MB: make test-all")
+    def test_the_least_kernels_build_the_same_bytes(self, tmp_path):
+        done = subprocess.run([sys.executable, "-m", "tools.setup_models"], capture_output=True, text=True,
+                              env=LEAST.variables() | {"LIMN_MODELS": str(tmp_path)})
+        assert done.returncode == 0, done.stderr
+        assert file_sha256(tmp_path / HEAD_MODEL_FILE) == file_sha256(models_folder() / HEAD_MODEL_FILE)

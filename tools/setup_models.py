@@ -22,6 +22,7 @@ from shared.errors import InputError, LimnError
 from shared.io.arrays import save_arrays, write_json
 from shared.io.models import LIST_FILE, file_sha256
 from shared.landmarks import FaceNetworks
+from shared.processor import use_baseline_opencv
 from tools.head_model import VERSION
 from tools.head_model.build import build_head_model
 
@@ -99,6 +100,7 @@ def is_complete(folder: Path) -> bool:
 
 def set_up(folder: Path) -> None:
     """Fetch, check, unpack and build; each file appears under its name only when whole, the list last."""
+    use_baseline_opencv()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

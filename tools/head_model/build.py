@@ -14,19 +14,23 @@ from tools.head_model.segments import SEGMENT_NAMES, face_segments
 from tools.head_model.shapes import EXPRESSIONS, head_shapes
 from tools.head_model.topology import head_topology
 
+MM_STEP, SHARE_STEP = 2.0**-14, 2.0**-20
+"""Lengths in mm and shares of one (uv, barycentric coordinates, weights) are rounded to multiples of these: kernels of
+libraries differ by 1e-13, and the same bytes come out."""
 
 def build_head_model(wheel: Path, networks: FaceNetworks) -> HeadModel:
-    """The whole model at level 0; deterministic."""
+    """The whole model at level 0; the same bytes on every processor."""
     source = MakeHuman(wheel)
     topology = head_topology(source.base, source.mirror())
     shapes = head_shapes(source, topology)
+    template = rounded(shapes.template, MM_STEP)
     bare = HeadModel(
-        template=shapes.template,
-        identity_basis=shapes.identity,
-        expression_basis=shapes.expression,
+        template=template,
+        identity_basis=rounded(shapes.identity, MM_STEP),
+        expression_basis=rounded(shapes.expression, MM_STEP),
         expression_names=tuple(EXPRESSIONS),
         faces=topology.faces,
-        uvs=np.zeros((len(shapes.template), 2)),
+        uvs=np.zeros((len(template), 2)),
         face_uvs=topology.faces,
         face_segment=np.zeros(len(topology.faces), np.uint8),
         segment_names=SEGMENT_NAMES,
@@ -36,14 +40,19 @@ def build_head_model(wheel: Path, networks: FaceNetworks) -> HeadModel:
     )
     embedding = embed_landmarks(bare, topology, networks)
     ear_motion = sum(np.linalg.norm(source.target(f"ears/{side}-ear-wing-incr"), axis=1) for side in "lr")
-    segment = face_segments(shapes.template, topology, embedding, ear_motion[topology.base_index])
-    uvs, face_uvs = texture_layout(shapes.template, topology, segment)
+    segment = face_segments(template, topology, embedding, ear_motion[topology.base_index])
+    uvs, face_uvs = texture_layout(template, topology, segment)
     return replace(
         bare,
-        uvs=uvs,
+        uvs=rounded(uvs, SHARE_STEP),
         face_uvs=face_uvs,
         face_segment=segment,
         landmark_face=embedding.face,
-        landmark_bary=embedding.bary,
-        landmark_weight=embedding.weight,
+        landmark_bary=rounded(embedding.bary, SHARE_STEP),
+        landmark_weight=rounded(embedding.weight, SHARE_STEP),
     )
+
+
+def rounded(values: np.ndarray, step: float) -> np.ndarray:
+    """The nearest multiples of the step, in the type of the values."""
+    return (np.round(np.asarray(values, np.float64) / step) * step).astype(values.dtype)

@@ -33,6 +33,8 @@ LIGHTS = ((0.35, 0.45, 0.8), (-0.35, 0.45, 0.8))
 IDENTITY_DEVIATION = 0.7
 SPREAD_MM = 3.0
 """Spread at which a landmark's weight has fallen to one half."""
+SAME_PLACE_MM = 1e-6
+"""Places on two faces this near to each other are one on their common edge, as the landmarks of the midline are."""
 MAX_SPREAD_MM = 8.0
 SEED = 468
 
@@ -155,14 +157,16 @@ def _symmetric(places: np.ndarray) -> np.ndarray:
 
 
 def _closest(fine: HeadModel, allowed: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Closest place to each point on the allowed faces: face [N], bary [N, 3]."""
+    """Closest place to each point on the allowed faces: face [N], bary [N, 3]; of faces that share it the first."""
     index = np.nonzero(allowed)[0]
     corners = fine.template[fine.faces[index]]
     near = cKDTree(corners.mean(1)).query(points, k=12)[1]
     a, b, c = (corners[near, k] for k in range(3))
     bary = _clamped_bary(points[:, None], a, b, c)
     found = (bary[..., None] * corners[near]).sum(2)
-    best = np.argmin(np.linalg.norm(found - points[:, None], axis=2), axis=1)
+    away = np.linalg.norm(found - points[:, None], axis=2)
+    shares = away <= away.min(axis=1, keepdims=True) + SAME_PLACE_MM
+    best = np.argmin(np.where(shares, near, len(index)), axis=1)
     rows = np.arange(len(points))
     return index[near[rows, best]].astype(np.int32), bary[rows, best]
 
