@@ -15,7 +15,7 @@ from tools.goldens.golden import differences, distance, read_golden, run_all, ru
 from tools.goldens.inputs import kept_folder, stage_of
 from tools.goldens.kernels import LEAST, OWN, WAYS
 from tools.goldens.measures import Measure
-from tools.goldens.mutations import MUTATIONS, noticed_by
+from tools.goldens.mutations import MUTATIONS, mutated_text, noticed_by
 from tools.goldens.tiny import SETTINGS, STAGES
 
 
@@ -42,6 +42,11 @@ def test_the_same_comes_out(stage, way, runs):
 
 def test_the_chain_is_as_good_as_it_was(tiny_run):
     assert not list(chain_differences(tiny_run / "export"))
+
+
+@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: m.name)
+def test_constants_of_the_list_stand_where_it_says(mutation):
+    assert mutation.after in mutated_text(mutation)
 
 
 @pytest.mark.parametrize("mutation", [m for m in MUTATIONS if m.quick or SLOW], ids=lambda m: m.name)
