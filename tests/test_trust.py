@@ -175,37 +175,52 @@ def test_hostile_subjects_stop_no_sound_one(tmp_path, pipeline):
     assert json.loads((batch / "summary-2.json").read_text())["exit_code"] == 2
 
 
-def as_nobody(*arguments, **environment):
-    """limn as a user that owns nothing; returns (exit code, output)."""
-    def drop():
-        os.setgroups([])
-        os.setgid(NOBODY)
-        os.setuid(NOBODY)
+class Unprivileged:
+    """limn without root's right to read everything: as a user that owns nothing or, where that one cannot reach this
+    Python, as root without the capabilities."""
 
-    done = subprocess.run([sys.executable, "-m", "tools.limn", *map(str, arguments)], text=True, timeout=120, cwd="/",
-                          env={**os.environ, "PYTHONPATH": str(REPOSITORY), "PYTHONDONTWRITEBYTECODE": "1",
-                               **environment}, preexec_fn=drop, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                          stderr=subprocess.STDOUT)
-    return done.returncode, done.stdout
+    def __init__(self, changes_user):
+        self.changes_user = changes_user
+        self.command = () if changes_user else ("setpriv", "--bounding-set", "-dac_override,-dac_read_search")
+
+    def own(self, folder):
+        if self.changes_user:
+            shutil.chown(folder, NOBODY, NOBODY)
+
+    def _drop(self):
+        if self.changes_user:
+            os.setgroups([])
+            os.setgid(NOBODY)
+            os.setuid(NOBODY)
+
+    def limn(self, *arguments, **environment):
+        """(exit code, output)"""
+        command = [*self.command, sys.executable, "-m", "tools.limn", *map(str, arguments)]
+        done = subprocess.run(command, text=True, timeout=300, cwd="/", preexec_fn=self._drop,
+                              env={**os.environ, "PYTHONPATH": str(REPOSITORY), "PYTHONDONTWRITEBYTECODE": "1",
+                                   **environment},
+                              stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        return done.returncode, done.stdout
 
 
 @pytest.fixture
-def shared_folder(tmp_path):
-    """A folder that every user reaches; skipped where there is no changing the user."""
+def unprivileged(tmp_path):
+    """One who runs limn in tmp_path; skipped where rights cannot be given up."""
     if os.geteuid() != 0:
         pytest.skip("only root can run as another user")
     folder = tmp_path
     while not folder.stat().st_mode & stat.S_IXOTH or folder == tmp_path:
         folder.chmod(folder.stat().st_mode | 0o055)
         folder = folder.parent
-    if any(not parent.stat().st_mode & stat.S_IXOTH for parent in Path(sys.executable).resolve().parents):
-        pytest.skip("another user cannot reach this Python")
-    return tmp_path
+    reached = all(parent.stat().st_mode & stat.S_IXOTH for parent in Path(sys.executable).resolve().parents)
+    if not reached and not shutil.which("setpriv"):
+        pytest.skip("another user cannot reach this Python, and setpriv is not there")
+    return Unprivileged(changes_user=reached)
 
 
-def test_another_user_without_a_home(shared_folder, pipeline):
+def test_another_user_without_a_home(tmp_path, unprivileged, pipeline):
     """Closed siblings and clips are these subjects' faults; the sound one runs, HOME or Snakemake's settings or not."""
-    batch, out = shared_folder / "batch", shared_folder / "out"
+    batch, out = tmp_path / "batch", tmp_path / "out"
     for name in ("sound", "closed", "clip", "work"):
         make_subject(batch / name)
     (batch / "lost+found").mkdir()
@@ -213,15 +228,15 @@ def test_another_user_without_a_home(shared_folder, pipeline):
     for path in (batch / "closed", batch / "lost+found", batch / "work" / "work", batch / "clip" / "clip.txt"):
         path.chmod(0)
     out.mkdir()
-    shutil.chown(out, NOBODY, NOBODY)
-    code, output = as_nobody("run", batch, "--pipeline", pipeline, "--out", out, HOME="/nonexistent/home",
-                             SNAKEMAKE_PROFILE="nothing-of-that-name", LIMN_TRUST=str(shared_folder / "toy"))
+    unprivileged.own(out)
+    code, output = unprivileged.limn("run", batch, "--pipeline", pipeline, "--out", out, HOME="/nonexistent/home",
+                                     SNAKEMAKE_PROFILE="nothing-of-that-name", LIMN_TRUST=str(tmp_path / "toy"))
     assert code == 2 and "Traceback" not in output, output
     assert (out / "sound" / "export" / "page.txt").is_file(), output
     assert (out / "work" / "export" / "page.txt").is_file()
     assert "clip.txt: cannot be read" in output or "cannot be read" in output
     assert "3 subjects: 2 done, 1 input error" in output, output
-    code, output = as_nobody("status", batch, "--pipeline", pipeline, LIMN_TRUST=str(shared_folder / "toy"))
+    code, output = unprivileged.limn("status", batch, "--pipeline", pipeline, LIMN_TRUST=str(tmp_path / "toy"))
     assert code == 2 and "Traceback" not in output and str(batch / "work" / "work") in output, output
 
 
