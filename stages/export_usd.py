@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 
 from shared.contract import Job, Output, Parameter, Stage, main
+from shared.contract.records import EXPORTED_POSES, RUN
 from shared.errors import LimnError
 
 STAGE = Stage(
@@ -40,12 +41,13 @@ STAGE = Stage(
         Output("envmap.exr", "the light, lat-long", space="world", colour_space="in the file"),
         Output("envmaps/*.exr", "the light of each clip, where there are several", space="world",
                colour_space="in the file", optional=True),
-        Output("poses.npz", "camera_from_head [F, 4, 4], frame_index [F], intrinsics [3, 3] of the frame", "mm"),
+        Output("poses.npz", "the head's pose in each frame, and the lens", "mm", fields=EXPORTED_POSES),
         Output("plates/*.jpg", "the clip's crops, sRGB; absent when plates is off", space="crop", optional=True),
         Output("renders/*.exr", "re-renders in full source frames", colour_space="in each file"),
         Output("views/*.exr", "novel and relit views, and the lights of the latter; absent when views is off",
                colour_space="in each file", optional=True),
-        Output("run.json", "parameters, model, costs, residuals and warnings of all stages", volatile=True),
+        Output("run.json", "parameters, model, costs, residuals and warnings of all stages", volatile=True,
+               fields=RUN),
         Output("report.html", "the page for people", volatile=True),
         Output("methods.txt", "what was done, to paste into a paper, with versions and references", volatile=True),
     ),

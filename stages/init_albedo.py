@@ -11,6 +11,7 @@ Fails    poses that match no frame; a head that no frame shows.
 from __future__ import annotations
 
 from shared.contract import Job, Output, Parameter, Stage, main
+from shared.contract.records import INIT
 from shared.errors import LimnError
 
 STAGE = Stage(
@@ -23,7 +24,7 @@ STAGE = Stage(
         Output("segment_albedo.exr", "one colour per segment", space="uv", colour_space="lin_rec709_scene"),
         Output("weight.exr", "sum of the samples' weights, in frames seen head-on", space="uv", colour_space="data"),
         Output("segments.png", "the mean texture with the segments' borders", space="uv", colour_space="srgb"),
-        Output("init.json", "colour, seen texels and frames of each segment"),
+        Output("init.json", "colour and seen texels of each segment", fields=INIT),
     ),
     parameters=(
         Parameter("size", int, 1024, "Edge of the maps.", "texels", choices=(64, 128, 256, 512, 1024, 2048, 4096)),

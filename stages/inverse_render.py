@@ -25,6 +25,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from shared.contract import Job, Output, Parameter, Stage, main
+from shared.contract.records import LADDER_TIMES, MESH, SOLVE, SOLVED_POSES
 from shared.errors import InputError, LimnError
 
 SOLVERS = ("transfer", "reference")
@@ -42,19 +43,19 @@ STAGE = Stage(
         Output("maps/*.exr", "albedo, specular intensity, roughness, normal, confidence", space="uv",
                colour_space="in each file"),
         Output("envmap.exr", "incident radiance, lat-long", space="world", colour_space="lin_rec709_scene"),
-        Output("mesh.npz", "the refined mesh, with its face segments", unit="mm", space="head"),
+        Output("mesh.npz", "the refined mesh, with its face segments", unit="mm", space="head", fields=MESH),
         Output("shape.png", "tracked and refined mesh, normals and difference, from three sides", colour_space="srgb"),
-        Output("poses.npz", "camera_from_head [F, 4, 4], frame_index [F], intrinsics of source and crop", unit="mm"),
+        Output("poses.npz", "the head's pose in each frame, and the lens", unit="mm", fields=SOLVED_POSES),
         Output("renders/*.exr", "re-renders of chosen crops, 0 outside the head", space="crop",
                colour_space="lin_rec709_scene"),
         Output("clips/*/envmap.exr", "the light of another clip", space="world", colour_space="lin_rec709_scene",
                optional=True),
-        Output("clips/*/poses.npz", "the poses of another clip", unit="mm", optional=True),
+        Output("clips/*/poses.npz", "the poses of another clip", unit="mm", optional=True, fields=SOLVED_POSES),
         Output("clips/*/renders/*.exr", "re-renders of another clip", space="crop", colour_space="lin_rec709_scene",
                optional=True),
-        Output("solve.json", "model, residuals, steps, scale of the albedo, held-out frames, warnings"),
+        Output("solve.json", "model, residuals, steps, scale of the albedo, held-out frames, warnings", fields=SOLVE),
         Output(LADDER_SECONDS, "what each rung of solve.json's ladder took (model=auto)", unit="s",
-               volatile=True, optional=True),
+               volatile=True, optional=True, fields=LADDER_TIMES),
     ),
     parameters=(
         Parameter("map_size", int, 1024, "Edge of the maps; a power of two.", "texels",

@@ -17,6 +17,7 @@ import numpy as np
 
 from shared.contract import Job, Output, Parameter, Stage, main
 from shared.contract.models import FACE_NETWORKS
+from shared.contract.records import FRAMES
 from shared.contract.subject import Subject
 from shared.errors import InputError, LimnError
 
@@ -27,7 +28,8 @@ STAGE = Stage(
     inputs=(),
     models=FACE_NETWORKS,
     outputs=(
-        Output("frames.json", "frames with their times, the crop and its camera, dropped frames with the reason"),
+        Output("frames.json", "frames with their times, the crop and its camera, dropped frames with the reason",
+               fields=FRAMES),
         Output("frames/*.png", "the crop in the source's code values", space="crop", colour_space="source"),
         Output("masks/*.png", "0 background, 128 person, 255 face", space="crop"),
         Output("contact_sheet.png", "nine of the crops with their masks' outlines", colour_space="srgb"),

@@ -16,6 +16,7 @@ import numpy as np
 
 from shared.contract import Job, Output, Parameter, Stage, main
 from shared.contract.models import FACE_NETWORKS, HEAD_MODEL_FILE
+from shared.contract.records import LANDMARKS, MESH, TRACKED_POSES, TRACKING, TRACKS
 
 STAGE = Stage(
     name="track_landmarks",
@@ -25,11 +26,13 @@ STAGE = Stage(
     given=("landmarks", "poses"),
     models=(*FACE_NETWORKS, HEAD_MODEL_FILE),
     outputs=(
-        Output("poses.npz", "camera_from_head [F, 4, 4], covariance [F, 6, 6], frame_index, intrinsics", unit="mm"),
-        Output("mesh.npz", "the fitted head with its UVs and face segments", unit="mm", space="head"),
-        Output("landmarks.npz", "the 468 landmarks of each used frame", unit="px", space="crop"),
-        Output("tracks.npz", "track points on the skin, their errors in pixels and in depth", unit="mm", space="head"),
-        Output("tracking.json", "residuals, rotation range, excluded frames with their reasons, warnings"),
+        Output("poses.npz", "the head's pose in each frame, its covariance, the lens", unit="mm", fields=TRACKED_POSES),
+        Output("mesh.npz", "the fitted head with its UVs and face segments", unit="mm", space="head", fields=MESH),
+        Output("landmarks.npz", "the 468 landmarks of each used frame", unit="px", space="crop", fields=LANDMARKS),
+        Output("tracks.npz", "track points on the skin, their errors in pixels and in depth", unit="mm", space="head",
+               fields=TRACKS),
+        Output("tracking.json", "residuals, rotation range, excluded frames with their reasons, warnings",
+               fields=TRACKING),
         Output("overlay.png", "mesh and landmarks drawn over five frames", colour_space="srgb"),
         Output("curves.png", "pose and its uncertainty over time", colour_space="srgb"),
         Output("residuals.png", "track errors in the texture's layout", space="uv", colour_space="srgb"),

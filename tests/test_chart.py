@@ -9,6 +9,8 @@ from shared.chart_finder import LEAST_LIKENESS, clipping_limit, find_chart, read
 from shared.chart_watch import ChartWatch
 from shared.color import decode_bt709, decode_srgb, encode_srgb
 from shared.contract.chart_place import AUTO, ChartPlace
+from shared.contract.fields import below, field_faults
+from shared.contract.records import FRAMES
 
 TABLE = decode_srgb(np.arange(256) / 255.0).astype(np.float32)
 LIMIT = clipping_limit(TABLE)
@@ -96,6 +98,7 @@ def test_the_watch_keeps_what_good_frames_say():
     watch = watched([empty, sharp, sharp, empty])
     records = watch.record()
     assert [record["frame_index"] for record in records] == [10, 20] and watch.warnings() == []
+    assert [field_faults(record, below(FRAMES, "chart[]")) for record in records] == [[], []]
     assert np.abs(np.array(records[0]["corners"]) - truth).max() < 0.6
     np.testing.assert_allclose(records[0]["white"], WHITE, rtol=0.01)
     expected = np.maximum(reflectances(), 0) * WHITE

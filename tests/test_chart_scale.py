@@ -7,6 +7,8 @@ from toy_chart import CENTRED, chart_pose
 from toy_head import toy_head
 
 from shared.chart import CORNERS, PATCHES, ChartSight, patch_sigma, reflectances, usable
+from shared.contract.fields import below, field_faults
+from shared.contract.records import SOLVE
 from shared.envmap import cube_directions
 from shared.geometry import WORLD_FROM_CAMERA, rigid
 from shared.raycast import RayScene
@@ -161,6 +163,7 @@ def test_what_is_recorded():
     assert "chart" not in describe_scale(None, skin)
     statement, _ = state_chart([sight_of(np.ones(3), frame=0)], far_scene(), POSE[None], INTRINSICS, "head")
     described = describe_scale(statement, skin)
+    assert field_faults(described, below(SOLVE, "albedo_scale")) == []
     assert described["method"].startswith("a colour chart") and described["chart"]["frames"] == [0]
     assert described["chart"]["irradiance_over_pi"] == [1.0, 1.0, 1.0]
     assert (np.abs(np.log(described["chart"]["priors_alone_factor"])) < 0.3).all()

@@ -11,6 +11,8 @@ from shapes import grid_plane
 from toy_head import toy_head
 
 from shared.color import decode_transfer, encode_srgb
+from shared.contract.fields import field_faults
+from shared.contract.records import RUN, SOLVE, SOLVED_POSES
 from shared.errors import InputError
 from shared.geometry import Similarity, project, rigid, rotation_from_vector
 from shared.mesh import interpolate, vertex_normals
@@ -194,6 +196,15 @@ def test_record_and_report_show_both_clips(pair):
     assert "<h3>dusk</h3>" in page and "day/track_landmarks" in page
     renders = list((pair / "work" / "inverse_render" / "clips" / "dusk" / "renders").glob("*.exr"))
     assert len(renders) == 1
+
+
+def test_files_of_both_clips_hold_what_is_declared(pair):
+    from shared.io.arrays import load_arrays
+
+    solved = pair / "work" / "inverse_render"
+    assert field_faults(json.loads((solved / "solve.json").read_text()), SOLVE) == []
+    assert field_faults(json.loads((pair / "export" / "run.json").read_text()), RUN) == []
+    assert field_faults(load_arrays(solved / "clips" / "dusk" / "poses.npz"), SOLVED_POSES) == []
 
 
 def test_what_takes_one_clip_says_so(pair, capsys):

@@ -1,13 +1,17 @@
 """Each reason and each warning of the tracking appears when it should, and only then."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from shared.contract.fields import below, field_faults
+from shared.contract.records import TRACKING
 from shared.geometry import rigid, rotation_from_vector, rotation_range_deg
 from shared.solve.judge_track import judge_frames, mouth_ratio, warnings_of
 from shared.solve.track_head import HeadTrack
+from stages.track_landmarks import excluded_frames
 
 FRAMES, POINTS = 20, 60
 LIPS = np.array([[-10.0, -40, 90], [0, -40, 95], [10, -40, 90]])
@@ -146,6 +150,14 @@ def test_mouth_with_few_tracks_is_not_judged():
     track = good_track(error_px=error, points_head=points)
     assert mouth_ratio(track, EVERY_FRAME, LIPS) == 1.0
     assert warnings(track) == []
+
+
+def test_excluded_frames_are_recorded_with_their_reasons():
+    frames = SimpleNamespace(count=3, frame_index=np.array([4, 6, 9]))
+    rows = excluded_frames(frames, np.array([0, 1]), np.array([1.0, 1.0, 0.2]), ["", "fits badly"])
+    assert rows == [{"frame_index": 6, "reason": "fits badly"},
+                    {"frame_index": 9, "reason": "no face found (presence 0.20)"}]
+    assert [field_faults(row, below(TRACKING, "excluded[]")) for row in rows] == [[], []]
 
 
 def test_many_excluded_frames():

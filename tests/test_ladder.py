@@ -17,7 +17,9 @@ from toy_capture import (
 )
 from toy_head import toy_head
 
+from shared.contract.fields import below, field_faults
 from shared.contract.job import Parameters
+from shared.contract.records import LADDER_TIMES, RUN, SOLVE
 from shared.errors import InputError
 from shared.report.gather import ladder_record
 from shared.report.model_sections import climbed_table
@@ -304,6 +306,9 @@ def test_the_ladder_reaches_run_json_and_the_report(glossy, tmp_path):
     seconds = [rung.pop("seconds") for rung in rungs]
     (tmp_path / "ladder_seconds.json").write_text(json.dumps(seconds))
     merged = ladder_record(tmp_path, {"ladder": rungs})
+    assert field_faults(seconds, LADDER_TIMES) == []
+    assert [field_faults(rung, below(SOLVE, "ladder[]")) for rung in rungs] == [[]] * len(rungs)
+    assert [field_faults(rung, below(RUN, "ladder[]")) for rung in merged] == [[]] * len(rungs)
     assert merged == [dict(record) for record in records]
     page = climbed_table(merged)
     assert page.count("<tr>") == 1 + len(records) and "harmonics 2" in page

@@ -7,7 +7,9 @@ import pytest
 import torch
 from toy_clip import FRAMES, LENS, MAP, SIZE, toy_clip, true_maps
 
+from shared.contract.fields import field_faults, written_fields
 from shared.contract.job import Parameters
+from shared.contract.records import SOLVE
 from shared.errors import InputError
 from shared.gather import SurfaceViewer
 from shared.solve.capture import Sizes
@@ -119,6 +121,10 @@ def test_vertices_move_towards_the_outline(clip):
     small = replace(clip, mesh=clip.mesh.replace(vertices=clip.mesh.vertices * 0.97))
     changes = {"vertices": True, "iterations": 40, "pixels": 300, "vertex_rate": 0.3, "sampling": Sampling(8, 8, 4)}
     result = solve_clip(small, settings_of(small, **changes), nothing, nothing)
+    record = summarise(small, result) | {"render_frames": [], "held_out_frames": []}
+    assert field_faults(record, SOLVE) == []
+    assert {f"iterations[].{name}" for name in ("iteration", "image", "mask", "laplacian", "white_light", "diffuse",
+                                                "roughness_variation")} <= written_fields(record, SOLVE)
     moved = result.viewer.mesh.vertices
     rim = np.abs(clip.mesh.vertices[:, 0]) > 60.0
     before = np.linalg.norm(small.mesh.vertices[rim] - clip.mesh.vertices[rim], axis=1).mean()

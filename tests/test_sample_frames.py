@@ -11,6 +11,8 @@ from toy_video import DrawnFaceNetworks, drawn_face, turning_face, write_video
 from shared.clip_survey import ClipSurvey
 from shared.color import decode_srgb
 from shared.contract import main
+from shared.contract.fields import field_faults
+from shared.contract.records import FRAMES
 from shared.face_tracker import FaceTracker
 from shared.geometry import rotation_from_vector
 from shared.io.frames import FrameSet
@@ -91,6 +93,7 @@ def test_stage_on_a_clip_with_faults(tmp_path, subject):
     code, out = subject(write_video(tmp_path / "clip.mp4", frames))
     assert code == 0
     content = frames_json(out)
+    assert field_faults(content, FRAMES) == []
     dropped = {entry["frame_index"]: entry["reason"].split(":")[0] for entry in content["dropped"]}
     assert dropped == {12: "blurred", 20: "repeats the frame before", 30: "black, or all of one colour"}
     kept = FrameSet.open(out)

@@ -16,6 +16,8 @@ from toy_capture import (
     true_light,
 )
 
+from shared.contract.fields import below, field_faults
+from shared.contract.records import SOLVE
 from shared.envmap import cube_directions
 from shared.geometry import fibonacci_sphere
 from shared.mesh import normalised
@@ -173,6 +175,7 @@ def test_a_step_that_leads_away_is_undone_and_ends_its_resolution(truth, monkeyp
     found = fit_appearance(capture, Settings(resolutions=(4, 8), steps=5, noise=(0.003, 0.01)))
     undone = [record for record in found.iterations if record.get("undone")]
     assert len(undone) == 1 and sum(trusted) == 1
+    assert field_faults(undone[0], below(SOLVE, "iterations[]")) == []
     shaping = [record for record in found.iterations if record["shaping"]]
     assert undone[0]["step"] == len(shaping) and undone[0]["resolution"] == 4
     assert found.held_out <= shaping[-1]["held_out"]

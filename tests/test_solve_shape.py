@@ -9,6 +9,8 @@ import scipy.sparse as sparse
 from shapes import sphere
 from toy_head import toy_head
 
+from shared.contract.fields import below, field_faults
+from shared.contract.records import SOLVE
 from shared.envmap import cube_directions
 from shared.gather import SurfaceViewer, prepare_picture
 from shared.geometry import projection_slope, rigid, rotation_from_vector
@@ -17,6 +19,7 @@ from shared.raycast import RayScene, camera_hits
 from shared.shading import Material, VertexShading
 from shared.solve.appearance import Settings
 from shared.solve.capture import Sizes, set_scenery
+from shared.solve.light_and_mesh import judge_shape
 from shared.solve.shape import Reflectance, ShapeClip, ShapeSettings, ShapeSolver, Surface
 from shared.solve.shape_equations import EquationSettings, excess
 from shared.solve.shape_step import TrackPoints, large_step_metric, normal_turns, solve_offsets
@@ -249,3 +252,13 @@ def test_the_shape_goes_on_past_one_worse_step_and_keeps_the_best(toy, monkeypat
     monkeypatch.setattr(solver, "examine", examine)
     monkeypatch.setattr(solver, "step", lambda surface, *_: np.ones(len(surface.mesh.vertices)))
     assert height(solver._refine_level(toy.start, toy.start.vertices, faces, ~faces, 0, None)) == kept
+
+
+@pytest.mark.parametrize("name, before, after", [("held_out", (0.03, 0.02), (0.01, 0.03)),
+                                                 ("fitted", (0.03, 0.0), (0.01, 0.0))])
+def test_a_mesh_is_judged_by_held_out_frames_where_there_are_any(name, before, after):
+    solutions = [SimpleNamespace(fitted=fitted, held_out=held_out) for fitted, held_out in (before, after)]
+    record = judge_shape(*solutions)
+    assert record["refined"] is (name == "fitted")
+    assert list(record[name]) == ["before", "after"]
+    assert field_faults(record | {"outline": {}}, below(SOLVE, "shape")) == []

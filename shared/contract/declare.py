@@ -1,6 +1,7 @@
 """What a stage declares: name, version, inputs, outputs, parameters.
 
-One declaration gives the command line, the validation, the cache key, the manifest and the table in the README.
+One declaration gives the command line, the validation, the cache key, the manifest, docs/parameters.md and
+docs/files.md.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import PurePosixPath
 
+from shared.contract.fields import Field
 from shared.contract.wording import unknown_name
 from shared.errors import InputError, shown
 
@@ -103,7 +105,7 @@ class Output:
     """A file of a stage's folder, or many by a pattern (`frames/*.png` or `frames/%06d.png`).
 
     volatile: holds times or the like, so its bytes say nothing about the result: listed, never hashed.
-    optional: may be absent. unit, space, colour_space: go into the manifest.
+    optional: may be absent. unit, space, colour_space: go into the manifest. fields: what a JSON or NPZ file holds.
     """
 
     path: str
@@ -113,6 +115,7 @@ class Output:
     colour_space: str = ""
     volatile: bool = False
     optional: bool = False
+    fields: tuple[Field, ...] = ()
 
     def matches(self, relative: str) -> bool:
         """Whether the file (posix path inside the stage's folder) is this output."""
@@ -196,7 +199,7 @@ class Stage:
 
 
 def parameter_table(stages: Sequence[Stage]) -> str:
-    """Markdown table of all parameters, for the README."""
+    """Markdown table of all parameters, for `limn parameters` and docs/parameters.md."""
     rows = ["| stage | parameter | default | range | unit | what |", "|---|---|---|---|---|---|"]
     for stage in stages:
         for p in stage.parameters:

@@ -1,0 +1,329 @@
+"""What stands in every JSON and NPZ file that the stages write; stages declare their outputs with these.
+
+docs/files.md is written from here (`python -m tools.readme`), and tests compare a run's files with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from shared.contract.fields import Field
+
+FRAME_INDEX = Field("frame_index", "The frames, counted from 0 in the source.", "int64", "F")
+POSES = Field("camera_from_head", "The head's pose in each frame: a rigid motion.", "float64", "F, 4, 4", "mm")
+SOURCE_LENS = Field("intrinsics", "The camera matrix of the full source frame.", "float64", "3, 3", "px")
+CROP_LENS = Field("intrinsics_crop", "The camera matrix of the crop.", "float64", "3, 3", "px")
+
+FRAMES = (
+    Field("source", "The clip.", ""),
+    Field("source.name", "Its file, or the pattern of numbered images.", "text"),
+    Field("source.width", "Of the picture as it is shown.", "int", unit="px"),
+    Field("source.height", "The same.", "int", unit="px"),
+    Field("source.fps", "Frames per second, as the file states them."),
+    Field("source.frame_count", "Frames in the clip.", "int"),
+    Field("source.codec", "How the clip is coded.", "text"),
+    Field("source.rotation_deg", "By how much the file says it is to be turned; the frames are turned.", "int",
+          unit="deg"),
+    Field("transfer", "The transfer function of the frames' code values.", "text"),
+    Field("moves", "What moved: `head` or `camera`.", "text"),
+    Field("crop", "The crop: u_crop = (u_source - x0) scale, pixel centres at integer + 0.5.", ""),
+    Field("crop.x0", "Its left edge in the source.", "int", unit="px"),
+    Field("crop.y0", "Its upper edge in the source.", "int", unit="px"),
+    Field("crop.width", "Its width in the source.", "int", unit="px"),
+    Field("crop.height", "Its height in the source.", "int", unit="px"),
+    Field("crop.scale", "Crop pixels per source pixel, at most 1."),
+    Field("size", "Width and height of the crop as it is stored.", "int", "2", "px"),
+    Field("intrinsics", "The camera matrix of the crop.", shape="3, 3", unit="px"),
+    Field("intrinsics_source", "The camera matrix of the full source frame.", shape="3, 3", unit="px"),
+    Field("focal_known", "Whether `subject.yaml` gives the focal length; otherwise it is a guess.", "bool"),
+    Field("frames", "One entry for each frame that was kept, in order.", ""),
+    Field("frames[].frame_index", "Its number in the source, from 0.", "int"),
+    Field("frames[].time_s", "Time since the first frame, as the file states it.", unit="s"),
+    Field("frames[].file", "The crop, relative to this folder.", "text"),
+    Field("frames[].mask", "Its mask, relative to this folder.", "text"),
+    Field("frames[].sharpness", "Fine detail compared with the neighbouring frames; 1: the same."),
+    Field("frames[].face_box", "Left, upper, right and lower edge of the landmarks in the crop.", shape="4", unit="px"),
+    Field("dropped", "One entry for each frame that was looked at and not kept for a fault.", ""),
+    Field("dropped[].frame_index", "Its number in the source, from 0.", "int"),
+    Field("dropped[].reason", "Why it was dropped.", "text"),
+    Field("chart", "One entry for each frame in which a colour chart can be used.", ""),
+    Field("chart[].frame_index", "Its number in the source, from 0.", "int"),
+    Field("chart[].corners", "Corners of the grid of patches in the source, beginning beside dark skin, then bluish "
+          "green, black, white.", shape="4, 2", unit="px"),
+    Field("chart[].pitch_px", "Distance between neighbouring patches.", unit="px"),
+    Field("chart[].patches", "Linear value of each patch.", shape="24, 3"),
+    Field("chart[].clipped", "1 where the value is only a lower bound, since the picture is clipped there; else 0.",
+          "int", "24, 3"),
+    Field("chart[].white", "Irradiance over pi on the chart.", shape="3"),
+    Field("chart[].log_sigma", "Standard deviation of its logarithm.", shape="3"),
+    Field("chart[].glare", "Linear value that a reflection adds to every patch.", shape="3"),
+    Field("chart[].trust", "Weight of each patch, 0 to 1.", shape="24"),
+    Field("chart[].misfit", "Relative error of the grey patches and of the coloured ones.", shape="2"),
+    Field("warnings", "What is wrong with the clip, one sentence each.", "text", "N"),
+)
+
+TRACKED_POSES = (
+    POSES,
+    Field("covariance", "Covariance of each pose: rotation (radians), then translation (mm).", "float64", "F, 6, 6"),
+    FRAME_INDEX,
+    SOURCE_LENS,
+    CROP_LENS,
+)
+MESH = (
+    Field("vertices", "Positions in head space.", "float64", "V, 3", "mm"),
+    Field("faces", "Triangles, as rows of `vertices`.", "int32", "faces, 3"),
+    Field("uvs", "Texture coordinates, v up.", "float64", "T, 2"),
+    Field("face_uvs", "Triangles, as rows of `uvs`.", "int32", "faces, 3"),
+    Field("face_segment", "Segment of each triangle: a position in `segments` of tracking.json. Absent where a mesh "
+          "without segments was given.", "uint8", "faces", optional=True),
+)
+LANDMARKS = (
+    Field("landmarks_px", "Landmarks in the crop, in the order of MediaPipe's face mesh.", "float64", "F, 468, 2",
+          "px"),
+    Field("presence", "The network's confidence that a face is there, 0 to 1.", "float64", "F"),
+    FRAME_INDEX,
+)
+TRACKS = (
+    Field("points_head", "Tracked points of the skin in head space.", "float64", "N, 3", "mm"),
+    Field("residual_px", "Median distance over the frames between a point as tracked and as the poses show it.",
+          "float64", "N", "px"),
+    Field("sigma_mm", "Standard deviation of each point in depth. Errors that neighbours share are included, so the "
+          "points count as independent.", "float64", "N", "mm"),
+)
+TRACKING = (
+    Field("segments", "Names of the face segments.", "text", "S"),
+    Field("frames", "Frames with a pose.", "int"),
+    Field("tracks", "Tracked points.", "int"),
+    Field("reprojection_px", "Distances between points as tracked and as the poses show them.", ""),
+    Field("reprojection_px.median", "Their median.", unit="px"),
+    Field("reprojection_px.p95", "What 95 % of them stay below.", unit="px"),
+    Field("held_out_px", "Median distance of tracks that were kept aside, under the poses before and after the "
+          "last fine pass.", ""),
+    Field("held_out_px.before", "Before.", unit="px"),
+    Field("held_out_px.after", "After.", unit="px"),
+    Field("rotation_range_deg", "Largest angle between two views of the head.", unit="deg"),
+    Field("rotation_deviation_deg", "Standard deviation of the rotations.", ""),
+    Field("rotation_deviation_deg.median", "Median over the frames.", unit="deg"),
+    Field("rotation_deviation_deg.max", "In the worst frame.", unit="deg"),
+    Field("noise_factor", "By which factor the variance of the poses exceeds what independent tracks would give; at "
+          "least 1."),
+    Field("focal", "What the tracks say about the focal length.", ""),
+    Field("focal.solved", "Whether the result uses the tracks' focal length (it was not given).", "bool"),
+    Field("focal.gain", "The focal length that the tracks ask for, relative to the one of `frames.json`."),
+    Field("focal.log_deviation", "Standard deviation of the logarithm of that."),
+    Field("scale", "What fixes the overall size.", "text"),
+    Field("identity", "The head model's identity coefficients.", shape="N"),
+    Field("expression", "Its expression coefficients.", shape="M"),
+    Field("excluded", "One entry for each frame without a pose.", ""),
+    Field("excluded[].frame_index", "Its number in the source, from 0.", "int"),
+    Field("excluded[].reason", "Why it was left out.", "text"),
+    Field("warnings", "What is wrong with the clip, one sentence each.", "text", "W"),
+)
+
+INIT = (
+    Field("segments", "One entry for each face segment.", ""),
+    Field("segments.<segment>.albedo", "Its colour, linear Rec.709.", shape="3"),
+    Field("segments.<segment>.texels_seen", "Texels that the colour comes from; 0: it is that of all skin.", "int"),
+    Field("frames", "Frames that were averaged.", "int"),
+    Field("seen_share", "Share of the head's texels that the frames show."),
+)
+
+SOLVED_POSES = (POSES, FRAME_INDEX, SOURCE_LENS, CROP_LENS)
+_REFERENCE = "solver=reference only:"
+_LADDER = (
+    Field("part", "Part of the model.", "text"),
+    Field("rung", "The choice that was tried for it.", "text"),
+    Field("held_out", "Error on the held-out frames."),
+    Field("fall", "By how much that is less than before.", "number or null"),
+    Field("standard_error", "Standard error of the fall.", "number or null"),
+    Field("climbed", "Whether the choice was kept.", "bool"),
+)
+
+
+def _under(path: str, fields: tuple[Field, ...]) -> tuple[Field, ...]:
+    return tuple(replace(field, path=f"{path}.{field.path}") for field in fields)
+
+
+_MODEL = (
+    Field("model", "The model that was solved.", ""),
+    Field("model.light", "The light's model in words.", "text"),
+    Field("model.moves", "What moved against the light: `head` or `camera`.", "text"),
+    Field("model.specular_intensity", "The typical specular intensity."),
+    Field("model.specular_variation", "How far texels share one specular intensity.", "text"),
+    Field("model.roughness", "The typical roughness."),
+    Field("model.roughness_variation", "Whether the roughness varies over the skin, and why; empty where it was not "
+          "tried.", ""),
+    Field("model.roughness_variation.chosen", "`one` value or `local`; with model=auto the name of the choice.", "text",
+          optional=True),
+    Field("model.roughness_variation.found_range", "5th and 95th percentile of the local roughness.", shape="2",
+          optional=True),
+    Field("model.roughness_variation.held_out", "Error on the held-out frames.", "", optional=True),
+    Field("model.roughness_variation.held_out.one", "With one value."),
+    Field("model.roughness_variation.held_out.local", "With local roughness."),
+)
+_SCALE = (
+    Field("albedo_scale", "What fixed the scale between light and albedo.", ""),
+    Field("albedo_scale.method", "In words.", "text"),
+    Field("albedo_scale.skin_albedo", "The skin's median albedo under it.", shape="3"),
+    Field("albedo_scale.skin_luminance", "Its luminance."),
+    Field("albedo_scale.chart", "What a colour chart said; absent without one.", "", optional=True),
+    Field("albedo_scale.chart.frames", "The frames in which it was read.", "int", "N"),
+    Field("albedo_scale.chart.irradiance_over_pi", "Light on the chart.", shape="3"),
+    Field("albedo_scale.chart.log_sigma", "Standard deviation of its logarithm.", shape="3"),
+    Field("albedo_scale.chart.priors_alone_factor", "By which factor the albedo would differ without the chart.",
+          shape="3"),
+)
+_CLIPS = (
+    Field("clips", "Of several clips, one entry each; absent for a single clip.", "", optional=True),
+    Field("clips[].name", "Its name in `subject.yaml`.", "text"),
+    Field("clips[].mesh", "Whether the mesh comes from this clip.", "bool"),
+    Field("clips[].matched_texels", "Texels by which the clip was placed on the mesh; absent where the mesh is its "
+          "own.", "int", optional=True),
+    Field("clips[].match_px", "Median distance between the clip's skin and the mesh, as its camera sees them; absent "
+          "where the mesh is its own.", unit="px", optional=True),
+    Field("clips[].render_frames", "Its frames that were re-rendered.", "int", "R"),
+    Field("clips[].held_out_frames", "Its frames that were not fitted.", "int", "H"),
+)
+SOLVE = (
+    *_MODEL,
+    Field("residuals", "Root mean square error of the re-rendered samples; 1 is the clip's white.", ""),
+    Field("residuals.fitted", "On the frames that were fitted."),
+    Field("residuals.held_out", "On the frames that were not."),
+    Field("residuals.texture_held_out", "On the latter after the texture pass, by how far texels share one specular "
+          "intensity.", ""),
+    Field("residuals.texture_held_out.<width>", "The error."),
+    Field("shape", "What the refinement of the mesh did; absent with solver=reference.", "", optional=True),
+    Field("shape.refined", "Whether the refined mesh was kept.", "bool"),
+    Field("shape.held_out", "Error on the held-out frames; absent where nothing was refined.", "", optional=True),
+    Field("shape.held_out.before", "With the tracked mesh."),
+    Field("shape.held_out.after", "With the refined mesh."),
+    Field("shape.fitted", "The same on fitted frames, where no frame could be held out.", "", optional=True),
+    Field("shape.fitted.before", "With the tracked mesh."),
+    Field("shape.fitted.after", "With the refined mesh."),
+    Field("shape.stopped_vertices", "Vertices that moved less than wanted, since the surface would have cut itself.",
+          "int", optional=True),
+    Field("shape.outline", "How the outline met the person masks; empty where it was not tried.", ""),
+    Field("shape.outline.met", "Share of the outline near a mask's border.", optional=True),
+    Field("shape.outline.fitted_px", "Mean distance in fitted frames.", "", optional=True),
+    Field("shape.outline.fitted_px.before", "Before.", unit="px"),
+    Field("shape.outline.fitted_px.after", "After.", unit="px"),
+    Field("shape.outline.held_out_px", "Mean distance in held-out frames.", "", optional=True),
+    Field("shape.outline.held_out_px.before", "Before.", unit="px"),
+    Field("shape.outline.held_out_px.after", "After.", unit="px"),
+    Field("relief", "The normal map; empty with normal_map=false, absent with solver=reference.", "", optional=True),
+    Field("relief.prior_radians", "Expected size of the turns.", unit="rad", optional=True),
+    Field("relief.confirmed_share", "Share of the turns that held-out frames confirm.", optional=True),
+    Field("relief.pooled_texels", "Standard width over which texels count together.", unit="texels", optional=True),
+    Field("relief.median_deg", "Median turn.", unit="deg", optional=True),
+    Field("relief.p95_deg", "What 95 % of the turns stay below.", unit="deg", optional=True),
+    Field("signs", "Signs of what the model cannot follow; absent with solver=reference.", "", optional=True),
+    Field("signs.frame_gain", "Standard deviation of the brightness from frame to frame."),
+    Field("signs.frame_tint", "The same of the colour, red against blue."),
+    Field("signs.albedo_by_orientation", "Standard deviation of the log albedo that follows the surface's "
+          "orientation."),
+    Field("signs.unlikely_colour", "How unlikely the colour of skin and light is, in standard deviations."),
+    Field("signs.covered_eyes", "Share of the skin around the eyes that fits far worse than the face; absent for a "
+          "mesh without segments.", optional=True),
+    Field("signs.covered_forehead", "The same of the forehead.", optional=True),
+    Field("ladder", "With model=auto: one entry for each choice that was tried, in order.", "", optional=True),
+    *_under("ladder[]", _LADDER),
+    Field("iterations", "One entry for each step of the light; with solver=reference, for some of the iterations.", ""),
+    Field("iterations[].light", "The light's model.", "text", optional=True),
+    Field("iterations[].resolution", "Edge of its cubemap faces.", "int", unit="texels", optional=True),
+    Field("iterations[].step", "Number of the step at this resolution, from 0.", "int", optional=True),
+    Field("iterations[].shaping", "Whether highlights did not take part yet.", "bool", optional=True),
+    Field("iterations[].undone", "Present where the step was undone.", "bool", optional=True),
+    Field("iterations[].fitted", "Error on the fitted frames.", optional=True),
+    Field("iterations[].held_out", "Error on the held-out frames.", optional=True),
+    Field("iterations[].cost", "What the step minimised, before it.", optional=True),
+    Field("iterations[].rescaled", "By how much the step changed the scale between light and albedo, as a "
+          "logarithm.", optional=True),
+    Field("iterations[].skin_prior", "The albedo's part of the cost.", optional=True),
+    Field("iterations[].specular_intensity", "The typical specular intensity after it.", optional=True),
+    Field("iterations[].roughness", "The typical roughness after it.", optional=True),
+    Field("iterations[].light_trust", "Of several clips: the weight of each clip's samples.", shape="C", optional=True),
+    Field("iterations[].iteration", f"{_REFERENCE} number of the iteration, from 1.", "int", optional=True),
+    *(Field(f"iterations[].{name}", f"{_REFERENCE} loss of {what}.", optional=True) for name, what in (
+        ("image", "the picture"), ("mask", "the mask"), ("laplacian", "the vertices' Laplacian"),
+        ("white_light", "the light's deviation from grey"), ("diffuse", "the squared diffuse albedo"),
+        ("roughness_variation", "the roughness's variation"))),
+    *_SCALE,
+    Field("seen_share_of_texels", "Share of the map's texels that the clip determines."),
+    Field("held_out_frames", "Frames of the (first) clip that were not fitted.", "int", "H"),
+    Field("render_frames", "Frames of the (first) clip that were re-rendered.", "int", "R"),
+    *_CLIPS,
+    Field("warnings", "What is wrong with the clip or the result, one sentence each.", "text", "W"),
+)
+
+LADDER_TIMES = (Field("[]", "Seconds of each entry of `ladder` in solve.json, in order.", unit="s"),)
+
+EXPORTED_POSES = (POSES, FRAME_INDEX, SOURCE_LENS)
+_STAGE_RECORD = (
+    Field("version", "The stage's version.", "int"),
+    Field("parameters.**", "Its parameters as used.", ""),
+    Field("wall_s", "Seconds that it took.", unit="s"),
+    Field("cpu_s", "Processor seconds.", unit="s"),
+    Field("peak_memory_mb", "Largest memory.", unit="MB"),
+    Field("warnings", "Its warnings.", "text", "W"),
+)
+RUN = (
+    Field("subject", "The subject's name.", "text"),
+    Field("stages", "One entry for each stage; of several clips `<clip>/<stage>` where it ran for each.", ""),
+    *_under("stages.<stage>", _STAGE_RECORD),
+    *_MODEL,
+    Field("residuals.**", "As in solve.json.", ""),
+    *_SCALE,
+    Field("held_out_frames", "Frames of the (first) clip that were not fitted.", "int", "H"),
+    *_CLIPS,
+    Field("ladder", "With model=auto: as in solve.json, and with the seconds of each.", "", optional=True),
+    *_under("ladder[]", _LADDER),
+    Field("ladder[].seconds", "Seconds that the choice took.", "number or null", unit="s"),
+    Field("warnings", "All warnings.", ""),
+    Field("warnings[].stage", "The stage that gave it; of several clips `<clip>/<stage>`.", "text"),
+    Field("warnings[].text", "The warning.", "text"),
+)
+
+MANIFEST = (
+    Field("schema", "Version of this form.", "int"),
+    Field("stage", "The stage's name.", "text"),
+    Field("version", "Its version.", "int"),
+    Field("parameters.**", "Its parameters as used.", ""),
+    Field("seed", "The seed of its random choices.", "int"),
+    Field("inputs", "SHA-256 of all that it read, by name.", ""),
+    Field("inputs.<name>", "Of a stage, over all of its files.", "text"),
+    Field("key", "SHA-256 of all of the above: equal keys, equal results.", "text"),
+    Field("outputs", "The files that it wrote, by name.", ""),
+    Field("outputs.<file>.volatile", "Present where the file's bytes differ from run to run; then nothing more is said "
+          "of its content.", "bool", optional=True),
+    Field("outputs.<file>.sha256", "Its hash.", "text", optional=True),
+    Field("outputs.<file>.bytes", "Its size.", "int", unit="bytes", optional=True),
+    Field("outputs.<file>.kind", "image, arrays, json, mesh, usd ...", "text", optional=True),
+    Field("outputs.<file>.shape.**", "Of a picture its height, width and channels; of arrays the shape of each.", "",
+          optional=True),
+    Field("outputs.<file>.unit", "Unit of length of what it holds.", "text", optional=True),
+    Field("outputs.<file>.space", "The space that positions or pixels belong to.", "text", optional=True),
+    Field("outputs.<file>.colour_space", "How colours are coded.", "text", optional=True),
+)
+PROVENANCE = (
+    Field("started", "When, in UTC.", "text"),
+    Field("wall_s", "Seconds that it took.", unit="s"),
+    Field("cpu_s", "Processor seconds.", unit="s"),
+    Field("peak_memory_mb", "Largest memory.", unit="MB"),
+    Field("host", "The machine's name.", "text"),
+    Field("platform", "Its operating system.", "text"),
+    Field("python", "Version of Python.", "text"),
+    Field("cores", "Its processor cores.", "int"),
+    Field("threads", "Threads that the stage was given.", "int"),
+    Field("cpu.machine", "The processor's architecture.", "text"),
+    Field("cpu.model", "Its name.", "text"),
+    Field("cpu.flags", "Its features.", "text"),
+    Field("kernels.**", "For which processor each library chose its loops, and the variables that decided on it.", ""),
+    Field("packages.<package>", "Version of each package that was loaded.", "text"),
+    Field("code.<file>", "Hash of each of Limn's files that was loaded, comments and layout apart.", "text"),
+    Field("command", "The command line.", "text", "N"),
+    Field("warnings", "Warnings of the stage.", "text", "W"),
+    Field("bytes", "Size of all its files.", "int", unit="bytes"),
+    Field("volatile", "Files whose bytes differ from run to run.", ""),
+    Field("volatile.<file>.sha256", "The hash.", "text"),
+    Field("volatile.<file>.bytes", "The size.", "int", unit="bytes"),
+)
