@@ -5,8 +5,7 @@ so that a still background cannot drift. What stands still while the head turns 
 somebody walks past; where hardly anything stands still and most corners move alike, the camera moved. A plain wall has
 no corners and says nothing.
 
-References: Shi and Tomasi, Good features to track, CVPR 1994; Bouguet, Pyramidal implementation of the Lucas Kanade
-feature tracker, 2000; Kalal et al., Forward-backward error, ICPR 2010.
+References: [Shi1994] (corners); [Bouguet2000] (flow in pyramids); [Kalal2010] (forward-backward error).
 """
 
 from __future__ import annotations

@@ -6,9 +6,7 @@ with the GGX distribution D, Smith's separable masking G1, Schlick's Fresnel ter
 alpha = roughness^2. Everything is written on cosines with plain operators, so numpy arrays and torch tensors both work
 and torch can differentiate it.
 
-References: Walter et al., Microfacet models for refraction through rough surfaces, EGSR 2007 (eqs. 33, 34);
-Schlick, An inexpensive BRDF model for physically-based rendering, 1994; Burley, Physically-based shading at Disney,
-2012 (alpha = roughness^2).
+References: [Walter2007] (eqs. 33, 34); [Schlick1994] (Fresnel term); [Burley2012] (alpha = roughness^2).
 """
 
 from __future__ import annotations
@@ -24,14 +22,14 @@ MINIMUM_COSINE = 1e-3
 
 
 def ggx_distribution(n_dot_h, roughness):
-    """D(h) per steradian (Walter 2007 eq. 33): alpha^2 / (pi ((n.h)^2 (alpha^2 - 1) + 1)^2)."""
+    """D(h) per steradian ([Walter2007] eq. 33): alpha^2 / (pi ((n.h)^2 (alpha^2 - 1) + 1)^2)."""
     alpha2 = roughness**4
     base = n_dot_h * n_dot_h * (alpha2 - 1.0) + 1.0
     return alpha2 / (np.pi * base * base)
 
 
 def smith_masking(n_dot_v, roughness):
-    """G1(v) (Walter 2007 eq. 34): 2 c / (c + sqrt(alpha^2 + (1 - alpha^2) c^2)) for c = n.v >= 0."""
+    """G1(v) ([Walter2007] eq. 34): 2 c / (c + sqrt(alpha^2 + (1 - alpha^2) c^2)) for c = n.v >= 0."""
     alpha2 = roughness**4
     return 2.0 * n_dot_v / (n_dot_v + (alpha2 + (1.0 - alpha2) * n_dot_v * n_dot_v) ** 0.5)
 
@@ -74,7 +72,7 @@ def microfacet_integrals(n_dot_o: np.ndarray, roughness: float, samples: int = 4
     """[N] cosines -> [3, N]: directional albedo and the split-sum factors A, B with albedo = F0 A + B.
 
     The half vector is sampled by inverting D's distribution on a product grid (midpoints in both random numbers), so
-    that each sample carries the weight G (o.h) / (cos_o n.h) (Karis, Real shading in Unreal Engine 4, 2013).
+    that each sample carries the weight G (o.h) / (cos_o n.h) [Karis2013].
     """
     cos_o = np.maximum(np.atleast_1d(np.asarray(n_dot_o, np.float64)), MINIMUM_COSINE)
     alpha2 = float(roughness) ** 4

@@ -5,7 +5,7 @@ points fixes them and steadies clips with little rotation. A Levenberg step over
 a second on two cores, where Ceres takes ten times as long over the same dense system, and its matrix gives the
 covariance.
 
-References: Triggs et al., Bundle adjustment - a modern synthesis, 2000, section 9 (gauge freedom); Levenberg 1944.
+References: [Triggs2000], section 9 (gauge freedom); [Levenberg1944] (damped steps).
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ def pose_covariance(
 ) -> PoseCovariance:
     """Inverse of the reduced camera system; place, turn and size of the whole cloud do not count.
 
-    The seven free modes are held by the smallest-norm gauge (Triggs et al. 2000, section 9.3).
+    The seven free modes are held by the smallest-norm gauge ([Triggs2000], section 9.3).
     """
     problem = BundleProblem(
         tracks,

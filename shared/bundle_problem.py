@@ -5,7 +5,7 @@ Every Jacobian passes through the point in camera axes, so that an observation i
 seen in most frames, so the reduced camera system is dense, and one matrix product builds it. Inside, components come
 first, [3, 3, F, n]: products of small matrices then run along frames and points, ten times faster than one by one.
 
-Reference: Triggs et al., Bundle adjustment - a modern synthesis, 2000, sections 3.3 (robust cost), 6.1 (elimination).
+Reference: [Triggs2000], sections 3.3 (robust cost), 6.1 (elimination).
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ k // 6 (dark skin first, black last). Reflectances are those that X-Rite states 
 adapted to D65 by Bradford's transform and expressed in linear Rec.709, so that a perfect white diffuser is (1, 1, 1):
 the convention of our albedo, in which the colour of the light belongs to the light.
 
-References: McCamy, Marcus, Davidson, A color-rendition chart, Journal of Applied Photographic Engineering 2, 1976.
+Reference: [Mccamy1976] (the chart).
 """
 
 from __future__ import annotations

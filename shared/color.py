@@ -1,7 +1,7 @@
 """Transfer functions, primaries and colour differences. Inside Limn colour is scene-linear Rec.709, white D65.
 
 References: IEC 61966-2-1 (sRGB); ITU-R BT.709-6 section 1.2 (camera curve); ITU-R BT.2100-2 tables 4 and 5 (PQ, HLG);
-CIE 142-2001 (CIEDE2000); SMPTE RP 177 (matrix of primaries); Lam 1985 (Bradford adaptation, as in ICC.1:2022 annex E).
+CIE 142-2001 (CIEDE2000); SMPTE RP 177 (matrix of primaries); [Lam1985] (Bradford adaptation, as in ICC.1:2022 annex E).
 """
 
 from __future__ import annotations

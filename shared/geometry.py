@@ -3,7 +3,7 @@
 Transforms are 4x4 matrices named target_from_source. Cameras follow OpenCV (x right, y down, z forward) with pixel
 centres at integer + 0.5.
 
-References: Umeyama, Least-squares estimation of transformation parameters between two point patterns, PAMI 1991.
+Reference: [Umeyama1991] (similarity between point sets).
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def world_from_head(camera_from_head: np.ndarray, moves: str) -> np.ndarray:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """The rotation [3, 3] closest to a matrix [3, 3] in the Frobenius norm (Kabsch, 1976)."""
+    """The rotation [3, 3] closest to a matrix [3, 3] in the Frobenius norm [Kabsch1976]."""
     u, _, vt = np.linalg.svd(matrix)
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
@@ -97,7 +97,7 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 def similarity_from_points(
     source: np.ndarray, target: np.ndarray, with_scale: bool = True, weights: np.ndarray | None = None
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Weighted least-squares similarity target ~ scale * R @ source + t (Umeyama 1991, eqs. 40 to 43).
+    """Weighted least-squares similarity target ~ scale * R @ source + t ([Umeyama1991], eqs. 40 to 43).
 
     source, target [N, 3]; weights [N] or None -> scale, R [3, 3], t [3].
     """

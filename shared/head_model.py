@@ -3,8 +3,7 @@
     vertices = template + sum_i identity_i B_i + sum_j expression_j E_j        (mm, head space)
 
 The bases are displacements: B_i for one standard deviation, E_j for one full facial action. Built at set-up
-from MakeHuman's CC0 data (tools.head_model); the form is that of Blanz and Vetter, A Morphable Model for the
-Synthesis of 3D Faces, 1999.
+from MakeHuman's CC0 data (tools.head_model); the form is that of [Blanz1999].
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ that a cast shadow ends about where the model lets it end. A little beside itsel
 see: the spread of n . W there, W being the irradiance vector of what is visible and n the point's own normal, is the
 standard deviation of its direct irradiance. Under a soft light that is little, under a lamp beside the nose all of it.
 
-Reference: the irradiance vector, Arvo, The irradiance Jacobian for partially occluded polyhedral sources, 1994.
+Reference: [Arvo1994] (the irradiance vector).
 """
 
 from __future__ import annotations

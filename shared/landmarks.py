@@ -5,9 +5,7 @@ through OpenCV's dnn module. The crops follow MediaPipe's graphs: the detector s
 letterboxed; the landmark network sees a square turned so that the eyes are level and 1.5 times as large as
 the face.
 
-References:
-    Bazarevsky et al., BlazeFace: Sub-millisecond Neural Face Detection on Mobile GPUs, 2019 (arXiv 1907.05047)
-    Kartynnik et al., Real-time Facial Surface Geometry from Monocular Video on Mobile GPUs, 2019 (arXiv 1907.06724)
+References: [Bazarevsky2019] (BlazeFace); [Kartynnik2019] (Face Mesh).
 """
 
 from pathlib import Path

@@ -1,7 +1,6 @@
 """Triangle meshes: normals, Laplacian, subdivision and the map from texels to the surface.
 
-References: Loop, Smooth subdivision surfaces based on triangles, 1987 (Warren's weights); Thuermer and Wuethrich,
-Computing vertex normals from polygonal facets, 1998 (weights by angle).
+References: [Loop1987] (subdivision, with Warren's weights); [Thuermer1998] (vertex normals, weights by angle).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How a head moves: with modest acceleration, sudden jerks excepted.
 
-A two-sided prior on second differences is the fixed-interval smoother of a constant-velocity model (Rauch, Tung and
-Striebel, 1965): it looks as far ahead as back and so does not lag. Its Cauchy weights let go of true jerks.
+A two-sided prior on second differences is the fixed-interval smoother of a constant-velocity model [Rauch1965]: it
+looks as far ahead as back and so does not lag. Its Cauchy weights let go of true jerks.
 """
 
 from __future__ import annotations

@@ -47,8 +47,8 @@ def edge_width(rgb: np.ndarray, inside: np.ndarray) -> float:
 def noise_share(rgb: np.ndarray, inside: np.ndarray) -> float:
     """Standard deviation of the noise inside bool [H, W], as a share of the light there.
 
-    rgb: uint8 [H, W, 3] sRGB; both are taken in linear light. NaN where too little is inside. Reference: Immerkaer,
-    Fast Noise Variance Estimation, CVIU 1996, with a median in place of the mean, which leaves out what is drawn.
+    rgb: uint8 [H, W, 3] sRGB; both are taken in linear light. NaN where too little is inside. Reference:
+    [Immerkaer1996], with a median in place of the mean, which leaves out what is drawn.
     """
     if np.count_nonzero(inside) < 100:
         return float("nan")

@@ -1,6 +1,6 @@
 """A robust pose from named points: the start of each frame.
 
-Reference: Lepetit et al., EPnP, IJCV 2009, inside RANSAC, through pycolmap.
+Reference: [Lepetit2009] (EPnP) inside RANSAC, through pycolmap.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ the product is again one weight per direction, and the caller need not know whic
 V~ is 1 for a point that nothing covers at any roughness, binary for a mirror, ambient occlusion when rough. The error
 grows with roughness (visibility and light are averaged apart), that of sums over the directions falls with it.
 
-References: Karis, Real shading in Unreal Engine 4, SIGGRAPH courses 2013 (split sum; prefiltering with n = o = r).
+Reference: [Karis2013] (split sum; prefiltering with n = o = r).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def narrowest_roughness(count: int) -> float:
 
 
 def sample_half_vectors(roughness: float, count: int = SAMPLES) -> np.ndarray:
-    """[count, 3] half vectors about +z distributed as D(h) n.h (Walter 2007, eq. 35), on a Fibonacci spiral."""
+    """[count, 3] half vectors about +z distributed as D(h) n.h ([Walter2007], eq. 35), on a Fibonacci spiral."""
     u = (np.arange(count) + 0.5) / count
     cos = np.sqrt((1.0 - u) / (1.0 + (roughness**4 - 1.0) * u))
     azimuth = np.pi * (1.0 + 5.0**0.5) * np.arange(count)
@@ -45,7 +45,7 @@ def sample_half_vectors(roughness: float, count: int = SAMPLES) -> np.ndarray:
 
 
 def frames_about(axis: np.ndarray) -> np.ndarray:
-    """[P, 3] unit vectors -> [P, 3, 3]: rows are two tangents and the axis (Duff et al., JCGT 2017)."""
+    """[P, 3] unit vectors -> [P, 3, 3]: rows are two tangents and the axis [Duff2017]."""
     x, y, z = axis.T
     sign = np.where(z >= 0.0, 1.0, -1.0)
     a = -1.0 / (sign + z)

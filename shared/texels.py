@@ -136,8 +136,8 @@ def smooth_field(
 
     Gaussian Markov field: neighbours differ by step, and a vertex from the mean [C] by spread, both standard
     deviations. Where nothing is known it continues its surroundings and sinks to the mean. Works across texture seams,
-    which a fill in the image cannot. region [V]: neighbours in different ones have nothing in common. Reference: Rue
-    and Held, Gaussian Markov Random Fields, 2005, section 3.
+    which a fill in the image cannot. region [V]: neighbours in different ones have nothing in common. Reference:
+    [Rue2005], section 3.
     """
     count = len(mesh.vertices)
     adjacency = vertex_adjacency(mesh.faces, count).tocoo()

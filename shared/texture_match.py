@@ -3,8 +3,7 @@
 Each clip's mean texture lies on a mesh of its own, fitted to its own tracks, so that the same freckle falls on slightly
 different texels. Dense flow between images of log local contrast, which show skin and not light, finds which.
 
-References: Kroeger et al., Fast optical flow using dense inverse search, ECCV 2016; Kalal et al., Forward-backward
-error, ICPR 2010.
+References: [Kroeger2016] (dense inverse search); [Kalal2010] (forward-backward error).
 """
 
 from __future__ import annotations

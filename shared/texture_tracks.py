@@ -5,7 +5,7 @@ frame, brought there by its believed pose, is off by a fraction of a pixel; inve
 small windows finds it, and how well it is known. Pixels that don't move with the skin (highlights, shadows' edges,
 hair) differ from the mean and lose their weight.
 
-Reference: Baker and Matthews, Lucas-Kanade 20 years on: a unifying framework, IJCV 2004, sections 3.2 and 5 (weights).
+Reference: [Baker2004], sections 3.2 (inverse-compositional Lucas-Kanade) and 5 (weights).
 """
 
 from __future__ import annotations

@@ -4,8 +4,7 @@ Landmark networks slide over the skin as the head turns. Here every frame is war
 by a surface that is roughly right (first the landmarks' triangulation, then the fitted head), so that what remains is a
 small motion, found by dense inverse search flow on images of log local contrast: those show skin, not light.
 
-References: Kroeger et al., Fast optical flow using dense inverse search, ECCV 2016; Kalal et al. (the check),
-Forward-backward error, ICPR 2010.
+References: [Kroeger2016] (dense inverse search); [Kalal2010] (the forward-backward check).
 """
 
 from __future__ import annotations

@@ -13,8 +13,7 @@ so all diffuse bounces are counted, and E = direct L + bounce (albedo_nodes * E_
 Memory: 2 bytes per point and direction plus 2 per point and node; 8000 points, 1024 directions and 1200 nodes take
 36 MB. Rays: half of the directions per point, embree's 3 to 4 M rays per second.
 
-References: Sloan, Kautz, Snyder, Precomputed radiance transfer, SIGGRAPH 2002 (interreflected transfer); Goral et al.,
-Modeling the interaction of light between diffuse surfaces, SIGGRAPH 1984 (radiosity).
+References: [Sloan2002] (interreflected transfer); [Goral1984] (radiosity).
 """
 
 from __future__ import annotations

@@ -2,13 +2,11 @@
 
 import json
 import re
-from pathlib import Path
 
 import pytest
 from toy_result import ToyJob, write_toy_work
 
 from shared.contract.pipeline import load_pipeline
-from shared.report import methods
 from shared.report.methods import ClipRecords, RunRecords, methods_paragraphs, methods_text
 from shared.report.references import REFERENCES
 from stages import export_usd
@@ -75,12 +73,6 @@ def test_numbered_images_are_not_decoded_as_video():
     found = records()
     text = methods_text(RunRecords(found.run, SOLVE, [ClipRecords("", images, TRACKING)], PACKAGES))
     assert "FFmpeg" not in text and "FFmpeg" in methods_text(found)
-
-
-def test_every_reference_is_of_use():
-    source = Path(methods.__file__).read_text(encoding="utf-8")
-    assert [key for key in REFERENCES if f"{key}}}" not in source and f'"{key}"' not in source] == []
-    assert len(set(REFERENCES.values())) == len(REFERENCES)
 
 
 def test_several_clips_are_told_one_by_one():

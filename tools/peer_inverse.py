@@ -4,11 +4,10 @@
 
 RUN: a run's folder whose work/ holds sample_frames and track_landmarks; their frames, mesh and poses are the ones that
 Limn solves from. Writes OUT/<seconds>/ with maps/, envmap.exr, poses.npz, mesh.obj, solve.json and cost.json, each
-after so many seconds of the solve (start-up and compilation count, writing does not).
-Unknown: albedo, specular intensity, roughness and the light, in the model that Limn solves. Method: path replay
-backpropagation (Vicini et al., SIGGRAPH 2021) with one bounce; Adam on one frame per step, the light's radiance in the
-logarithm; the result is the iterates' running mean. Needs mitsuba with its LLVM variant (DRJIT_LIBLLVM_PATH names
-libLLVM where it is not found).
+after so many seconds of the solve (start-up and compilation count, writing does not). Unknown: albedo, specular
+intensity, roughness and the light, in the model that Limn solves. Method: path replay backpropagation [Vicini2021] with
+one bounce; Adam on one frame per step, the light's radiance in the logarithm; the result is the iterates' running mean.
+Needs mitsuba with its LLVM variant (DRJIT_LIBLLVM_PATH names libLLVM where it is not found).
 """
 
 from __future__ import annotations

@@ -5,8 +5,7 @@ sampling of the light are Mitsuba's. Matte surfaces are its own `diffuse`; our l
 plugin, is written here as a BSDF of its own, apart from shared.brdf. The variant is scalar_rgb, which needs no LLVM;
 LIMN_MITSUBA_VARIANT names another one.
 
-References: Jakob et al., Mitsuba 3 renderer, 2022; Walter et al., Microfacet models for refraction through rough
-surfaces, EGSR 2007 (eqs. 33 to 36).
+References: [Jakob2022] (the renderer); [Walter2007] (eqs. 33 to 36).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Bring a result's head frame onto the ground truth's: a similarity from camera centres, then trimmed ICP.
 
 A result may use any head frame and any scale. The camera centres of the common frames give a first similarity; a
-trimmed point-to-plane ICP (Chen and Medioni 1992) with a weak point-to-point term, on the true face's points only,
-gives the final one. Arrays in, arrays out.
+trimmed point-to-plane ICP [Chen1992] with a weak point-to-point term, on the true face's points only, gives the final
+one. Arrays in, arrays out.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Well spread sample points and the directions drawn from them.
 
-References: Duff et al., Building an orthonormal basis, revisited, JCGT 2017; Dupuy and Benyoub, Sampling visible GGX
-normals with spherical caps, HPG 2023.
+References: [Duff2017] (tangent frames); [Dupuy2023] (visible normals of GGX).
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray:
 
 
 def tangent_frame(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[N, 3] unit normals -> two tangents [N, 3] that complete a right-handed frame (Duff et al., listing 3)."""
+    """[N, 3] unit normals -> two tangents [N, 3] that complete a right-handed frame ([Duff2017], listing 3)."""
     x, y, z = normals[..., 0], normals[..., 1], normals[..., 2]
     sign = np.copysign(np.ones_like(z), z)
     a = -1.0 / (sign + z)

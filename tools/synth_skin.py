@@ -1,9 +1,8 @@
 """Procedural skin: reflectance textures for the head model from a seed.
 
 Tone follows two pigments, melanin and haemoglobin, whose amounts vary over the face and absorb each colour channel
-differently (after Tsumura et al., Image-based skin color and texture analysis/synthesis by extracting hemoglobin and
-melanin information, SIGGRAPH 2003; the numbers here are chosen by eye). Patterns live in the head's 3D space, so UV
-seams do not show.
+differently (after [Tsumura2003]; the numbers here are chosen by eye). Patterns live in the head's 3D space, so UV seams
+do not show.
 """
 
 from __future__ import annotations

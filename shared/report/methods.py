@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 from shared.contract.subject import is_sequence
 from shared.report.references import REFERENCES
 
-_KEY = re.compile(r"\{([a-z]+[0-9]{4})\}")
+_KEY = re.compile(r"\{([A-Z][a-z]+[0-9]{4})\}")
 _LIGHTS = {
     "cubemap": "a cubemap of which every texel is unknown",
-    "harmonics_2": "the exponential of spherical harmonics of order 2 {ramamoorthi2001} {ren2006}",
-    "harmonics_4": "the exponential of spherical harmonics of order 4 {ren2006}",
-    "sun_sky": "one sun and a sky of spherical harmonics {ren2006}",
+    "harmonics_2": "the exponential of spherical harmonics of order 2 {Ramamoorthi2001} {Ren2006}",
+    "harmonics_4": "the exponential of spherical harmonics of order 4 {Ren2006}",
+    "sun_sky": "one sun and a sky of spherical harmonics {Ren2006}",
     "camera": "one lamp at the camera in a uniform light",
 }
 _CLOSING = ("This text was written by Limn from the records of the run. It is dedicated to the public domain (CC0): "
@@ -93,10 +93,10 @@ def _opening(records: RunRecords) -> Iterable[str]:
     versions = ", ".join(f"{name.rpartition('/')[2]} {stage['version']}" for name, stage in _one_clip(records).items())
     limn = records.tool("Limn", "limn")
     yield (f"Mesh, reflectance and light were recovered from video by {limn} (stages {versions}), which "
-           "goes on from the method of {xu2025}, in a workflow of Snakemake {molder2021}.")
+           "goes on from the method of {Xu2025}, in a workflow of Snakemake {Molder2021}.")
     tools = [records.tool(name, package) + f" {{{key}}}" for name, package, key in (
-        ("NumPy", "numpy", "harris2020"), ("SciPy", "scipy", "virtanen2020"), ("PyTorch", "torch", "paszke2019"),
-        ("Numba", "numba", "lam2015")) if package in records.packages]
+        ("NumPy", "numpy", "Harris2020"), ("SciPy", "scipy", "Virtanen2020"), ("PyTorch", "torch", "Paszke2019"),
+        ("Numba", "numba", "Lam2015")) if package in records.packages]
     if tools:
         yield f"Computations used {_listed(tools)}."
 
@@ -112,8 +112,8 @@ def _sampling(records: RunRecords) -> Iterable[str]:
     names = [str((clip.frames.get("source") or {}).get("name", "")) for clip in records.clips]
     if not all(map(is_sequence, names)):
         yield f"Video was decoded with {records.tool('FFmpeg through PyAV', 'av')}."
-    yield ("Faces were found by BlazeFace {bazarevsky2019} and 468 landmarks by Face Mesh {kartynnik2019} (MediaPipe's "
-           f"networks, run by {records.tool('OpenCV', 'opencv-contrib-python-headless')} {{bradski2000}}).")
+    yield ("Faces were found by BlazeFace {Bazarevsky2019} and 468 landmarks by Face Mesh {Kartynnik2019} (MediaPipe's "
+           f"networks, run by {records.tool('OpenCV', 'opencv-contrib-python-headless')} {{Bradski2000}}).")
     for clip in records.clips:
         source, kept, dropped = (clip.frames.get(name) for name in ("source", "frames", "dropped"))
         if not source or kept is None:
@@ -135,10 +135,10 @@ def _tracking(records: RunRecords) -> Iterable[str]:
     if given:
         yield f"The tracking used {' and '.join(given)} that another tracker gave."
     yield ("The head was tracked as one rigid body: from the landmarks, skin was followed by dense inverse search flow "
-           "{kroeger2016} with a forward-backward check {kalal2010}, then matched against the clip's own mean texture "
-           "{baker2004}, and poses and points were adjusted together {triggs2000}.")
-    yield ("A linear head model {blanz1999} built from MakeHuman's data (CC0) was fitted to the points {chen1992} and "
-           "then bent towards them {botsch2008}; its mean size sets the scale.")
+           "{Kroeger2016} with a forward-backward check {Kalal2010}, then matched against the clip's own mean texture "
+           "{Baker2004}, and poses and points were adjusted together {Triggs2000}.")
+    yield ("A linear head model {Blanz1999} built from MakeHuman's data (CC0) was fitted to the points {Chen1992} and "
+           "then bent towards them {Botsch2008}; its mean size sets the scale.")
     for clip in records.clips:
         error, turn = clip.tracking.get("reprojection_px"), clip.tracking.get("rotation_range_deg")
         if error and turn is not None:
@@ -154,11 +154,11 @@ def _averaging(records: RunRecords) -> Iterable[str]:
 
 def _solving(records: RunRecords) -> Iterable[str]:
     parameters = records.parameters("inverse_render")
-    yield ("Reflectance is Lambertian plus a specular intensity times a GGX lobe {walter2007} with Schlick's Fresnel "
-           "term for a base of 4 % {schlick1994} and alpha the square of the roughness {burley2012}.")
+    yield ("Reflectance is Lambertian plus a specular intensity times a GGX lobe {Walter2007} with Schlick's Fresnel "
+           "term for a base of 4 % {Schlick1994} and alpha the square of the roughness {Burley2012}.")
     if parameters.get("solver") == "reference":
         yield ("Mesh, textures and light were solved by stochastic gradient descent through a deferred renderer as "
-               "published {xu2025} {nicolet2021} {karis2013}.")
+               "published {Xu2025} {Nicolet2021} {Karis2013}.")
     else:
         yield from _transfer(parameters)
     yield from _shape(parameters, records.solve.get("shape") or {})
@@ -174,16 +174,16 @@ def _counted(count: int) -> str:
 
 def _transfer(parameters: Mapping[str, object]) -> Iterable[str]:
     if parameters.get("visibility"):
-        traced = "Visibility, traced with Embree {wald2014},"
-        known = f"{traced} and all diffuse bounces {{goral1984}} were" if parameters.get("bounce") else f"{traced} was"
-        yield f"{known} computed once in head space and reused by all frames {{sloan2002}}."
+        traced = "Visibility, traced with Embree {Wald2014},"
+        known = f"{traced} and all diffuse bounces {{Goral1984}} were" if parameters.get("bounce") else f"{traced} was"
+        yield f"{known} computed once in head space and reused by all frames {{Sloan2002}}."
     light = _LIGHTS.get(str(parameters.get("light_model")))
     if parameters.get("model") == "auto":
         yield ("The model of light, visibility, highlights and shape was chosen step by step, where the error on "
-               "held-out frames fell by more than its standard error {breiman1984}.")
+               "held-out frames fell by more than its standard error {Breiman1984}.")
     elif light:
         yield (f"The light was modelled as {light}, and solved by Gauss-Newton steps with the albedo eliminated "
-               "{golub1973} {kaufman1975}.")
+               "{Golub1973} {Kaufman1975}.")
     if parameters.get("specular"):
         yield "Albedo and specular intensity were then solved in closed form for each texel."
     elif parameters.get("specular") is False:
@@ -196,9 +196,9 @@ def _shape(parameters: Mapping[str, object], shape: Mapping[str, object]) -> Ite
     if parameters.get("poses"):
         yield "The poses were given."
     if parameters.get("silhouette") and "outline" in shape:
-        yield "Ears, skull and jaw were moved so that the outline meets the person masks {cipolla2000}."
+        yield "Ears, skull and jaw were moved so that the outline meets the person masks {Cipolla2000}."
     if shape.get("refined"):
-        yield "The mesh was refined from shading, parallax and tracks in large smooth steps {nicolet2021}."
+        yield "The mesh was refined from shading, parallax and tracks in large smooth steps {Nicolet2021}."
     elif "refined" in shape:
         yield "A mesh refined from shading fitted held-out frames no better and was not used."
 
@@ -207,7 +207,7 @@ def _scale(records: RunRecords) -> Iterable[str]:
     scale = records.solve.get("albedo_scale") or {}
     if "chart" in scale:
         yield ("The scale between light and albedo, which no clip tells by itself, was set by a 24-patch colour chart "
-               "in view {mccamy1976}.")
+               "in view {Mccamy1976}.")
     elif "method" in scale:
         yield (f"The scale between light and albedo, which no clip tells by itself, was set by {scale['method']}.")
 

@@ -1,64 +1,117 @@
-"""The literature that the methods text may cite."""
+"""The literature that docstrings and comments cite as [Key], and the methods text as {Key}: docs/bibliography.md."""
 
 REFERENCES = {
-    "xu2025": "Xu et al., Monocular Facial Appearance Capture in the Wild. ICCV 2025.",
-    "molder2021": "Mölder et al., Sustainable data analysis with Snakemake. F1000Research 10:33, 2021.",
-    "harris2020": "Harris et al., Array programming with NumPy. Nature 585, 2020.",
-    "virtanen2020":
-        "Virtanen et al., SciPy 1.0: fundamental algorithms for scientific computing in Python. Nature "
-        "Methods 17, 2020.",
-    "paszke2019": "Paszke et al., PyTorch: An Imperative Style, High-Performance Deep Learning Library. NeurIPS 2019.",
-    "lam2015": "Lam, Pitrou, Seibert, Numba: a LLVM-based Python JIT compiler. LLVM-HPC 2015.",
-    "bradski2000": "Bradski, The OpenCV Library. Dr. Dobb's Journal of Software Tools, 2000.",
-    "bazarevsky2019":
-        "Bazarevsky et al., BlazeFace: Sub-millisecond Neural Face Detection on Mobile GPUs. arXiv "
-        "1907.05047, 2019.",
-    "kartynnik2019":
-        "Kartynnik et al., Real-time Facial Surface Geometry from Monocular Video on Mobile GPUs. arXiv "
-        "1907.06724, 2019.",
-    "kroeger2016": "Kroeger et al., Fast Optical Flow using Dense Inverse Search. ECCV 2016.",
-    "kalal2010":
-        "Kalal, Mikolajczyk, Matas, Forward-Backward Error: Automatic Detection of Tracking Failures. ICPR "
-        "2010.",
-    "baker2004":
-        "Baker, Matthews, Lucas-Kanade 20 Years On: A Unifying Framework. International Journal of Computer "
-        "Vision 56, 2004.",
-    "triggs2000":
-        "Triggs et al., Bundle Adjustment - A Modern Synthesis. Vision Algorithms: Theory and Practice, 2000.",
-    "blanz1999": "Blanz, Vetter, A Morphable Model for the Synthesis of 3D Faces. SIGGRAPH 1999.",
-    "chen1992":
-        "Chen, Medioni, Object modelling by registration of multiple range images. Image and Vision Computing"
-        " 10, 1992.",
-    "botsch2008":
-        "Botsch, Sorkine, On Linear Variational Surface Deformation Methods. IEEE Transactions on "
-        "Visualization and Computer Graphics 14, 2008.",
-    "walter2007": "Walter et al., Microfacet Models for Refraction through Rough Surfaces. EGSR 2007.",
-    "schlick1994":
-        "Schlick, An Inexpensive BRDF Model for Physically-based Rendering. Computer Graphics Forum 13, 1994.",
-    "burley2012": "Burley, Physically-Based Shading at Disney. SIGGRAPH courses, 2012.",
-    "wald2014":
-        "Wald et al., Embree: A Kernel Framework for Efficient CPU Ray Tracing. ACM Transactions on Graphics "
-        "33, 2014.",
-    "goral1984": "Goral et al., Modeling the Interaction of Light Between Diffuse Surfaces. SIGGRAPH 1984.",
-    "sloan2002":
-        "Sloan, Kautz, Snyder, Precomputed Radiance Transfer for Real-Time Rendering in Dynamic, Low-"
-        "Frequency Lighting Environments. SIGGRAPH 2002.",
-    "ramamoorthi2001":
+    "Arvo1994": "Arvo, The Irradiance Jacobian for Partially Occluded Polyhedral Sources. SIGGRAPH 1994.",
+    "Baker2004":
+        "Baker, Matthews, Lucas-Kanade 20 Years On: A Unifying Framework. International Journal of Computer Vision "
+        "56, 2004.",
+    "Bazarevsky2019":
+        "Bazarevsky et al., BlazeFace: Sub-millisecond Neural Face Detection on Mobile GPUs. arXiv 1907.05047, 2019.",
+    "Beaton1974":
+        "Beaton, Tukey, The Fitting of Power Series, Meaning Polynomials, Illustrated on Band-Spectroscopic Data. "
+        "Technometrics 16, 1974.",
+    "Blanz1999": "Blanz, Vetter, A Morphable Model for the Synthesis of 3D Faces. SIGGRAPH 1999.",
+    "Botsch2008":
+        "Botsch, Sorkine, On Linear Variational Surface Deformation Methods. IEEE Transactions on Visualization and "
+        "Computer Graphics 14, 2008.",
+    "Bouguet2000": "Bouguet, Pyramidal Implementation of the Lucas Kanade Feature Tracker. Intel Corporation, 2000.",
+    "Bradski2000": "Bradski, The OpenCV Library. Dr. Dobb's Journal of Software Tools, 2000.",
+    "Breiman1984": "Breiman et al., Classification and Regression Trees. Wadsworth, 1984.",
+    "Burley2012": "Burley, Physically-Based Shading at Disney. SIGGRAPH courses, 2012.",
+    "Chen1992":
+        "Chen, Medioni, Object modelling by registration of multiple range images. Image and Vision Computing 10, "
+        "1992.",
+    "Cipolla2000": "Cipolla, Giblin, Visual Motion of Curves and Surfaces. Cambridge University Press, 2000.",
+    "Collins2014":
+        "Collins, Bartoli, Infinitesimal Plane-Based Pose Estimation. International Journal of Computer Vision 109, "
+        "2014.",
+    "Duff2017":
+        "Duff et al., Building an Orthonormal Basis, Revisited. Journal of Computer Graphics Techniques 6, 2017.",
+    "Dupuy2023": "Dupuy, Benyoub, Sampling Visible GGX Normals with Spherical Caps. High-Performance Graphics 2023.",
+    "Geman1985":
+        "Geman, McClure, Bayesian Image Analysis: An Application to Single Photon Emission Tomography. American "
+        "Statistical Association, 1985.",
+    "Golub1973":
+        "Golub, Pereyra, The Differentiation of Pseudo-Inverses and Nonlinear Least Squares Problems Whose Variables "
+        "Separate. SIAM Journal on Numerical Analysis 10, 1973.",
+    "Goral1984": "Goral et al., Modeling the Interaction of Light Between Diffuse Surfaces. SIGGRAPH 1984.",
+    "Harris2020": "Harris et al., Array programming with NumPy. Nature 585, 2020.",
+    "He2010": "He, Sun, Tang, Guided Image Filtering. ECCV 2010.",
+    "He2015": "He, Sun, Fast Guided Filter. arXiv 1505.00996, 2015.",
+    "Horn1975": "Horn, Obtaining Shape from Shading Information. The Psychology of Computer Vision, McGraw-Hill 1975.",
+    "Immerkaer1996": "Immerkaer, Fast Noise Variance Estimation. Computer Vision and Image Understanding 64, 1996.",
+    "Jakob2022": "Jakob et al., Mitsuba 3 renderer. 2022.",
+    "Kabsch1976":
+        "Kabsch, A Solution for the Best Rotation to Relate Two Sets of Vectors. Acta Crystallographica A32, 1976.",
+    "Kalal2010":
+        "Kalal, Mikolajczyk, Matas, Forward-Backward Error: Automatic Detection of Tracking Failures. ICPR 2010.",
+    "Karis2013": "Karis, Real Shading in Unreal Engine 4. SIGGRAPH courses, 2013.",
+    "Kartynnik2019":
+        "Kartynnik et al., Real-time Facial Surface Geometry from Monocular Video on Mobile GPUs. arXiv 1907.06724, "
+        "2019.",
+    "Kaufman1975":
+        "Kaufman, A variable projection method for solving separable nonlinear least squares problems. BIT 15, 1975.",
+    "Kroeger2016": "Kroeger et al., Fast Optical Flow using Dense Inverse Search. ECCV 2016.",
+    "Laine2020": "Laine et al., Modular Primitives for High-Performance Differentiable Rendering. SIGGRAPH Asia 2020.",
+    "Lam1985": "Lam, Metamerism and Colour Constancy. PhD thesis, University of Bradford, 1985.",
+    "Lam2015": "Lam, Pitrou, Seibert, Numba: a LLVM-based Python JIT compiler. LLVM-HPC 2015.",
+    "Lepetit2009":
+        "Lepetit, Moreno-Noguer, Fua, EPnP: An Accurate O(n) Solution to the PnP Problem. International Journal of "
+        "Computer Vision 81, 2009.",
+    "Levenberg1944":
+        "Levenberg, A Method for the Solution of Certain Non-Linear Problems in Least Squares. Quarterly of Applied "
+        "Mathematics 2, 1944.",
+    "Loop1987": "Loop, Smooth Subdivision Surfaces Based on Triangles. Master's thesis, University of Utah, 1987.",
+    "Mccamy1976":
+        "McCamy, Marcus, Davidson, A Color-Rendition Chart. Journal of Applied Photographic Engineering 2, 1976.",
+    "Mikkelsen2008":
+        "Mikkelsen, Simulation of Wrinkled Surfaces Revisited. Master's thesis, University of Copenhagen, 2008.",
+    "Moeller1997":
+        "Möller, Trumbore, Fast, Minimum Storage Ray-Triangle Intersection. Journal of Graphics Tools 2, 1997.",
+    "Molder2021": "Mölder et al., Sustainable data analysis with Snakemake. F1000Research 10:33, 2021.",
+    "Munkberg2022": "Munkberg et al., Extracting Triangular 3D Models, Materials, and Lighting From Images. CVPR 2022.",
+    "Nicolet2021": "Nicolet, Jacobson, Jakob, Large Steps in Inverse Rendering of Geometry. SIGGRAPH Asia 2021.",
+    "Paszke2019": "Paszke et al., PyTorch: An Imperative Style, High-Performance Deep Learning Library. NeurIPS 2019.",
+    "Ramamoorthi2001":
         "Ramamoorthi, Hanrahan, An Efficient Representation for Irradiance Environment Maps. SIGGRAPH 2001.",
-    "ren2006":
-        "Ren et al., Real-time Soft Shadows in Dynamic Scenes using Spherical Harmonic Exponentiation. "
-        "SIGGRAPH 2006.",
-    "breiman1984": "Breiman et al., Classification and Regression Trees. Wadsworth, 1984.",
-    "golub1973":
-        "Golub, Pereyra, The Differentiation of Pseudo-Inverses and Nonlinear Least Squares Problems Whose "
-        "Variables Separate. SIAM Journal on Numerical Analysis 10, 1973.",
-    "kaufman1975":
-        "Kaufman, A variable projection method for solving separable nonlinear least squares problems. BIT "
-        "15, 1975.",
-    "nicolet2021": "Nicolet, Jacobson, Jakob, Large Steps in Inverse Rendering of Geometry. SIGGRAPH Asia 2021.",
-    "karis2013": "Karis, Real Shading in Unreal Engine 4. SIGGRAPH courses, 2013.",
-    "cipolla2000": "Cipolla, Giblin, Visual Motion of Curves and Surfaces. Cambridge University Press, 2000.",
-    "mccamy1976":
-        "McCamy, Marcus, Davidson, A Color-Rendition Chart. Journal of Applied Photographic Engineering 2, "
-        "1976.",
+    "Rasmussen2006": "Rasmussen, Williams, Gaussian Processes for Machine Learning. MIT Press, 2006.",
+    "Rauch1965": "Rauch, Tung, Striebel, Maximum Likelihood Estimates of Linear Dynamic Systems. AIAA Journal 3, 1965.",
+    "Ren2006":
+        "Ren et al., Real-time Soft Shadows in Dynamic Scenes using Spherical Harmonic Exponentiation. SIGGRAPH 2006.",
+    "Rue2005": "Rue, Held, Gaussian Markov Random Fields: Theory and Applications. Chapman and Hall, 2005.",
+    "Schlick1994":
+        "Schlick, An Inexpensive BRDF Model for Physically-based Rendering. Computer Graphics Forum 13, 1994.",
+    "Shi1994": "Shi, Tomasi, Good Features to Track. CVPR 1994.",
+    "Sloan2002":
+        "Sloan, Kautz, Snyder, Precomputed Radiance Transfer for Real-Time Rendering in Dynamic, Low-Frequency "
+        "Lighting Environments. SIGGRAPH 2002.",
+    "Smith2015": "Smith, Schaefer, Bijective Parameterization with Free Boundaries. SIGGRAPH 2015.",
+    "Smith2019":
+        "Smith, de Goes, Kim, Analytic Eigensystems for Isotropic Distortion Energies. ACM Transactions on Graphics "
+        "38, 2019.",
+    "Szeliski1997":
+        "Szeliski, Kang, Shape Ambiguities in Structure from Motion. IEEE Transactions on Pattern Analysis and "
+        "Machine Intelligence 19, 1997.",
+    "Thuermer1998":
+        "Thürmer, Wüthrich, Computing Vertex Normals from Polygonal Facets. Journal of Graphics Tools 3, 1998.",
+    "Triggs2000":
+        "Triggs et al., Bundle Adjustment - A Modern Synthesis. Vision Algorithms: Theory and Practice, 2000.",
+    "Tsumura2003":
+        "Tsumura et al., Image-Based Skin Color and Texture Analysis/Synthesis by Extracting Hemoglobin and Melanin "
+        "Information in the Skin. SIGGRAPH 2003.",
+    "Tutte1963": "Tutte, How to Draw a Graph. Proceedings of the London Mathematical Society 13, 1963.",
+    "Umeyama1991":
+        "Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point Patterns. IEEE Transactions"
+        " on Pattern Analysis and Machine Intelligence 13, 1991.",
+    "Veach1995": "Veach, Guibas, Optimally Combining Sampling Techniques for Monte Carlo Rendering. SIGGRAPH 1995.",
+    "Vicini2021": "Vicini, Speierer, Jakob, Path Replay Backpropagation. SIGGRAPH 2021.",
+    "Virtanen2020":
+        "Virtanen et al., SciPy 1.0: fundamental algorithms for scientific computing in Python. Nature Methods 17, "
+        "2020.",
+    "Wald2014":
+        "Wald et al., Embree: A Kernel Framework for Efficient CPU Ray Tracing. ACM Transactions on Graphics 33, "
+        "2014.",
+    "Walter2007": "Walter et al., Microfacet Models for Refraction through Rough Surfaces. EGSR 2007.",
+    "Wang2009": "Wang et al., All-Frequency Rendering of Dynamic, Spatially-Varying Reflectance. SIGGRAPH Asia 2009.",
+    "Xu2025": "Xu et al., Monocular Facial Appearance Capture in the Wild. ICCV 2025.",
 }

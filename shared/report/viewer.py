@@ -1,6 +1,6 @@
 """The mesh for the page's 3D view: reduced, quantised and packed into base64 text; light as order-2 harmonics.
 
-References: Ramamoorthi and Hanrahan, An efficient representation for irradiance environment maps, 2001.
+Reference: [Ramamoorthi2001] (irradiance by nine harmonics).
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ def _text(array: np.ndarray) -> str:
 def irradiance_harmonics(envmap: np.ndarray) -> np.ndarray:
     """[H, W, 3] lat-long radiance -> [9, 3] such that sum_k c_k Y_k(n) is irradiance / pi for the normal n.
 
-    Y_k as polynomials 1, y, z, x, xy, yz, 3z^2-1, xz, x^2-y^2 with their constants folded into c (Ramamoorthi and
-    Hanrahan 2001, eqs. 3 and 8: the clamped cosine weighs the orders by pi, 2 pi / 3, pi / 4).
+    Y_k as polynomials 1, y, z, x, xy, yz, 3z^2-1, xz, x^2-y^2 with their constants folded into c ([Ramamoorthi2001],
+    eqs. 3 and 8: the clamped cosine weighs the orders by pi, 2 pi / 3, pi / 4).
     """
     height, width = envmap.shape[:2]
     v, u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")

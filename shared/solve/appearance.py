@@ -4,13 +4,13 @@ Model of point v, frame f, channel c:  a[v, c] E[v, f, c] + s S[v, f, c], with E
 all diffuse bounces) and S the specular lobe sum, both linear in the light. Unknown: the light's parameters, one
 specular intensity s, one roughness, the albedo of each point.
 
-Method. Albedo is eliminated: for any light it is a weighted least-squares solution per point and channel, and only
-the residual that no albedo can explain drives the light (variable projection; Golub and Pereyra 1973, with Kaufman's
-1975 approximation of the derivative). The light takes Gauss-Newton steps, each solved by conjugate gradients with
-products only: a step touches the clip some twenty times and costs about as much as rendering it that often. Specular
-intensity and the logarithm of the roughness are unknowns of the same step, eliminated likewise. Weights are robust
-(Cauchy, by reweighting) and clipped or crushed samples only push when the model violates what they say. Steps end when
-frames that were held out stop improving.
+Method. Albedo is eliminated: for any light it is a weighted least-squares solution per point and channel, and only the
+residual that no albedo can explain drives the light (variable projection [Golub1973], with the approximation of the
+derivative of [Kaufman1975]). The light takes Gauss-Newton steps, each solved by conjugate gradients with products only:
+a step touches the clip some twenty times and costs about as much as rendering it that often. Specular intensity and the
+logarithm of the roughness are unknowns of the same step, eliminated likewise. Weights are robust (Cauchy, by
+reweighting) and clipped or crushed samples only push when the model violates what they say. Steps end when frames that
+were held out stop improving.
 """
 
 from __future__ import annotations

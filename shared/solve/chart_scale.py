@@ -11,7 +11,7 @@ the corners and the patches, and the spread of the factor between them counts:
   look alike, and a plane that faces the camera shows its tilt only to second order.
 - Its depth, since charts come in many sizes: some way before, beside or behind the head, which shades it differently.
 
-References: Collins and Bartoli, Infinitesimal plane-based pose estimation, IJCV 2014 (cv2.SOLVEPNP_IPPE).
+Reference: [Collins2014] (cv2.SOLVEPNP_IPPE).
 """
 
 from __future__ import annotations

@@ -122,9 +122,8 @@ def frame_gains(solver: AppearanceSolver, model: torch.Tensor) -> np.ndarray:
 def by_orientation(albedo: np.ndarray, normals: np.ndarray) -> float:
     """Standard deviation of the part of log luminance of albedo [P, 3] that quadratics in the normals [P, 3] explain.
 
-    Quadratics hold nearly all that a lamp does to a matte surface (Ramamoorthi and Hanrahan, An Efficient
-    Representation for Irradiance Environment Maps, SIGGRAPH 2001). Points far from the others count for nothing: hair
-    over the forehead and a beard look up and down, too. Biweights, from the median on (Beaton and Tukey, 1974).
+    Quadratics hold nearly all that a lamp does to a matte surface [Ramamoorthi2001]. Points far from the others count
+    for nothing: hair over the forehead and a beard look up and down, too. Biweights, from the median on [Beaton1974].
     """
     x, y, z = normalised(normals).T
     design = np.stack([np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], axis=1)

@@ -4,7 +4,7 @@ Track points carry no names: each pulls its nearest place on the surface along t
 slide over the skin, so they steer the lids, lips and brows and weigh little. What the codes leave is for the free
 correction, see shared.solve.fit_surface.
 
-Reference: Chen and Medioni, Object modelling by registration of multiple range images, 1992 (point to plane).
+Reference: [Chen1992] (point to plane).
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class FitWeights:
 
 
 PUBLISHED = FitWeights(track_mm=2.8 * (100.0 / 30.0) ** 0.5, landmark_mm=2.8)
-"""Landmarks 100, skin 30, as Xu et al. (ICCV 2025) weigh landmark and photometric losses: what the pictures say of the
+"""Landmarks 100, skin 30, as [Xu2025] weighs landmark and photometric losses: what the pictures say of the
 skin reaches the fit here as tracks."""
 
 

@@ -2,7 +2,7 @@
 
 It stays the model's where no track is.
 
-Reference: Botsch and Sorkine, On linear variational surface deformation methods, TVCG 2008.
+Reference: [Botsch2008].
 """
 
 from __future__ import annotations

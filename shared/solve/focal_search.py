@@ -5,8 +5,7 @@ focal length there moves it by a few per cent only, however wrong it is; tracks 
 given way, too. So a thin part of the dense flow, which follows the pictures alone, is adjusted under lenses over a
 range, each held, from poses at the distance that goes with it. What is left of the cost tells which one it asks for.
 
-The trade between focal length, distance and relief: Triggs et al., Bundle adjustment - a modern synthesis, 2000,
-section 9; Szeliski and Kang, Shape ambiguities in structure from motion, PAMI 1997.
+References: [Triggs2000], section 9, and [Szeliski1997] (the trade between focal length, distance and relief).
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ by frame, falls by more than its standard error; where a rung brings unknowns, a
 that is worth while. Rungs are not all nested (a sun in the sky is no special case of harmonics), so that the one beyond
 a rung that did not serve is tried, too, and where the climb ends without shadows, all parts at once.
 
-References: Breiman et al., Classification and regression trees, 1984, 3.4.3 (the one-standard-error rule).
+Reference: [Breiman1984], section 3.4.3 (the one-standard-error rule).
 """
 
 from __future__ import annotations

@@ -9,10 +9,8 @@ The logarithm keeps radiance positive and makes smoothness relative, so that a l
 room costs no more than its edge. Every model gives a cubemap, its derivative along a change of the parameters, and the
 transpose of that: all the solver needs.
 
-References: Ren et al., Real-time soft shadows in dynamic scenes using spherical harmonic exponentiation, SIGGRAPH 2006
-(radiance as the exponential of harmonics); Ramamoorthi and Hanrahan, An efficient representation for irradiance
-environment maps, SIGGRAPH 2001 (order 2 for matte surfaces); Wang et al., All-frequency rendering of dynamic,
-spatially-varying reflectance, SIGGRAPH Asia 2009 (spherical Gaussians).
+References: [Ren2006] (radiance as the exponential of harmonics); [Ramamoorthi2001] (order 2 for matte surfaces);
+[Wang2009] (spherical Gaussians).
 """
 
 from __future__ import annotations

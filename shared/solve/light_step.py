@@ -6,9 +6,7 @@ of the specular intensity and the roughness under their priors, would absorb. Th
 transpose needs no second projection. A light a little too blurred and a lobe a little too narrow show nearly the same,
 so that steps of the light and of the roughness in turn would creep.
 
-References: Golub and Pereyra, The differentiation of pseudo-inverses and nonlinear least squares problems whose
-variables separate, 1973; Kaufman, A variable projection method for solving separable nonlinear least squares
-problems, 1975.
+References: [Golub1973] and [Kaufman1975] (variable projection).
 """
 
 from __future__ import annotations

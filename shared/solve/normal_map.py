@@ -6,8 +6,7 @@ shares in a frame is laid to light, pose and mesh: only finer relief counts. Equ
 resolve, so that no texel claims more, and the turn has a prior of none. Held-out frames say how wide the prior is and
 what share of the relief is true.
 
-Reference: Horn, Obtaining shape from shading information, 1975; tangents as of Mikkelsen, Simulation of wrinkled
-surfaces revisited, 2008 (MikkTSpace).
+References: [Horn1975] (shape from shading); [Mikkelsen2008] (tangents of MikkTSpace).
 """
 
 from __future__ import annotations

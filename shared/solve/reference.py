@@ -1,4 +1,4 @@
-"""The published algorithm: mesh, textures and light by stochastic gradient descent through a deferred renderer.
+"""The published algorithm [Xu2025]: mesh, textures and light by stochastic descent through a deferred renderer.
 
 Each iteration renders one frame: primary visibility with blended silhouettes (reference_raster), diffuse light by
 multiple importance sampling with traced visibility and a visibility-modulated split sum (reference_shade), under a

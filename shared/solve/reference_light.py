@@ -3,9 +3,8 @@
 Light is a tensor [6 n^2, 3], texels as in shared.envmap. Look-ups are bilinear over faces with a border of one texel:
 they cross edges without a seam, and are differentiable by the light and by the direction.
 
-References: Karis, Real shading in Unreal Engine 4, SIGGRAPH courses 2013 (prefiltering with n = o = r); Munkberg et
-al., Extracting triangular 3D models, materials, and lighting from images, CVPR 2022 (mips as prefiltered light,
-roughness 0.08 to 0.5 over all levels but the last, which stands for 1).
+References: [Karis2013] (prefiltering with n = o = r); [Munkberg2022] (mips as prefiltered light, roughness 0.08 to 0.5
+over all levels but the last, which stands for 1).
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@ differentiates: moving a vertex slides texture and normals under the pixel. At s
 which has no derivative; there the two pixels on either side are blended by where the edge crosses the line between
 their centres, and the crossing carries the gradient.
 
-Reference: Laine et al., Modular primitives for high-performance differentiable rendering, SIGGRAPH Asia 2020, section
-3.6 (antialiasing). Theirs looks for the edge among those of the nearer pixel's triangle; here every silhouette edge is
-drawn along the lines between pixel centres, so that triangles smaller than a pixel do not hide it.
+Reference: [Laine2020], section 3.6 (antialiasing). Theirs looks for the edge among those of the nearer pixel's
+triangle; here every silhouette edge is drawn along the lines between pixel centres, so that triangles smaller than a
+pixel do not hide it.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class Raster:
         direction = self._tensor(self._rays[pixels] @ rotation)
         index = torch.from_numpy(face.astype(np.int64)).to(self._device)
         a, b, c = vertices[self._faces[index]].unbind(1)
-        # Moeller and Trumbore, Fast, minimum storage ray/triangle intersection, 1997
+        # ray against triangle [Moeller1997]
         across = torch.linalg.cross(direction, c - a)
         scale = 1.0 / (across * (b - a)).sum(1)
         from_a = origin - a

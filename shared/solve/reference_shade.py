@@ -7,8 +7,7 @@ with visibility V by a ray of each sample and V~ the mean visibility of 64 direc
 light bounces. Gradients reach light, albedo, specular intensity, roughness, and through positions and normals the
 vertices; visibility and the samples themselves count as constant, as published.
 
-References: Veach and Guibas, Optimally combining sampling techniques for Monte Carlo rendering, SIGGRAPH 1995; Karis,
-Real shading in Unreal Engine 4, SIGGRAPH courses 2013.
+References: [Xu2025]; [Veach1995] (balance heuristic); [Karis2013] (split sum).
 """
 
 from __future__ import annotations

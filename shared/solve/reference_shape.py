@@ -1,6 +1,6 @@
 """Vertices as the reference solver moves them: preconditioned steps, kept smooth by the Laplacian.
 
-Reference: Nicolet et al., Large steps in inverse rendering of geometry, SIGGRAPH Asia 2021 (u = (I + lambda L) x).
+Reference: [Nicolet2021] (u = (I + lambda L) x).
 """
 
 from __future__ import annotations

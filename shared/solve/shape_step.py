@@ -8,7 +8,7 @@ around them by the derivative of angle-weighted vertex normals. The prior is on 
 the metric in which large steps descend: neighbours move together over some sqrt(lambda) edges, and what nothing pulls
 stays where it was. L is the combinatorial Laplacian.
 
-Reference: Nicolet, Jacobson, Jakob, Large steps in inverse rendering of geometry, 2021.
+Reference: [Nicolet2021].
 """
 
 from __future__ import annotations

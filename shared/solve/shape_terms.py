@@ -6,7 +6,7 @@ sides. Reflections are differenced at anchors some millimetres apart and carried
 
     S_p = sum_a w_pa (S_a + G_a . (n_p - n_a))
 
-Reference: the irradiance vector, Arvo, The irradiance Jacobian for partially occluded polyhedral sources, 1994.
+Reference: [Arvo1994] (the irradiance vector).
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A rim point is where an edge of the mesh turns from the camera's side to the far side. It counts where nothing of the
 mesh lies beyond it and the mask's border is near: there the outline has to touch the border. To first order the outline
 moves as the rim point does along the surface's normal, which lies in the picture's plane: sliding of the rim over the
-surface changes nothing (Cipolla and Giblin, Visual Motion of Curves and Surfaces, 2000, chapter 4).
+surface changes nothing ([Cipolla2000], chapter 4).
 
 The unknown is a displacement of the vertices of the mesh before its last subdivision, smooth as large steps are, so
 that ears and skull, which no track and little shading reaches, move as a whole.

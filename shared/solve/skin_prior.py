@@ -14,7 +14,7 @@ face share and, smaller, what tells them apart:
 Finer texture is independent between patches of the skin. What the samples determine they go on determining: all of this
 weighs as much as some ten observations.
 
-References: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 2.7 (a free mean).
+Reference: [Rasmussen2006], section 2.7 (a free mean).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from shared.transfer import spread_vertices
 PATCHES = 150
 _OUTLYING = 2.0
 """Points so many textures away from their patch's mean, and patches so far off the smooth field, count a quarter, and
-those further away soon nothing (Geman and McClure 1985): hair, beards, what a wrong shape or a shadow's edge spoils."""
+those further away soon nothing [Geman1985]: hair, beards, what a wrong shape or a shadow's edge spoils."""
 _REWEIGHTED = 3
 
 

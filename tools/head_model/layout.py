@@ -1,11 +1,11 @@
 """Texture layout of the head alone, in the unit square.
 
-Skin, mouth bag and eye sockets are one island that fills a rectangle: the surface is cut along the middle
-line from behind the hairline to the nape, laid out flat by a harmonic map with the boundary on the
-rectangle's sides (Tutte, How to draw a graph, 1963: never folds), then relaxed under the symmetric Dirichlet
-energy (Smith and Schaefer, Bijective parameterization with free boundaries, 2015), whose inverse term keeps
-every triangle unfolded. The boundary slides along the sides. The face asks for more texels per mm than scalp
-and neck, the hidden cavities for few. The four halves of the eyeballs lie in a strip below.
+Skin, mouth bag and eye sockets are one island that fills a rectangle: the surface is cut along the
+middle line from behind the hairline to the nape, laid out flat by a harmonic map with the boundary on
+the rectangle's sides ([Tutte1963]: never folds), then relaxed under the symmetric Dirichlet energy
+[Smith2015], whose inverse term keeps every triangle unfolded. The boundary slides along the sides. The
+face asks for more texels per mm than scalp and neck, the hidden cavities for few. The four halves of the
+eyeballs lie in a strip below.
 """
 
 import numpy as np

@@ -3,11 +3,10 @@ triangle.
 
     E = sum_t w_t A_t (|J_t|^2 + |J_t^-1|^2)
 
-J_t is the Jacobian from triangle t at rest (laid flat, scaled) to its layout; E is smallest, 4 per unit of
-weight, where every triangle keeps its shape and size. Smith and Schaefer, Bijective parameterization with
-free boundaries, 2015. Minimised by Newton's method with each triangle's Hessian made positive semidefinite in
-closed form (Smith, de Goes and Kim, Analytic eigensystems for isotropic distortion energies, 2019); the line
-search never steps to where a triangle would flip.
+J_t is the Jacobian from triangle t at rest (laid flat, scaled) to its layout; E is smallest, 4 per unit
+of weight, where every triangle keeps its shape and size [Smith2015]. Minimised by Newton's method with
+each triangle's Hessian made positive semidefinite in closed form [Smith2019]; the line search never
+steps to where a triangle would flip.
 """
 
 import numpy as np
