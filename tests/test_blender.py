@@ -109,7 +109,7 @@ def test_light_arrives(seen):
 
 
 def test_what_blender_drops(seen):
-    """The README's list: when a later Blender keeps one of these, this test says so."""
+    """The list of docs/blender.md: when a later Blender keeps one of these, this test says so."""
     file, _, found = seen
     if file == "head.glb":
         return

@@ -1,18 +1,34 @@
-"""The README says what the code says."""
+"""The README and docs/ say what the code says, and every link leads somewhere."""
 
-import importlib
 import re
-from pathlib import Path
+import tomllib
 
 import pytest
+import yaml
 
 from shared.contract.pipeline import load_pipeline
-from tools.readme import README, SCORES, cost_table, with_tables
+from tools.readme import DOCS, README, SCORES, cost_table, documents
+
+TEXTS = sorted([*README.parent.glob("*.md"), *DOCS.glob("*.md")])
+_FENCED = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
+_LINK = re.compile(r"\]\((?!https?:|mailto:)([^)\s]+)\)")
+_HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 
 
-def test_tables_are_up_to_date():
-    text = README.read_text(encoding="utf-8")
-    assert text == with_tables(text), "run: python -m tools.readme"
+
+@pytest.mark.parametrize("path", documents(), ids=lambda path: path.name)
+def test_tables_are_up_to_date(path):
+    assert path.read_text(encoding="utf-8") == documents()[path], "run: python -m tools.readme"
+
+
+def test_every_parameter_and_every_file_is_listed():
+    stages = load_pipeline().stages.values()
+    parameters, files = ((DOCS / name).read_text(encoding="utf-8") for name in ("parameters.md", "files.md"))
+    for stage in stages:
+        missing = [p.name for p in stage.parameters if f"| {stage.name} | `{p.name}` |" not in parameters]
+        assert not missing and f"## `{stage.folder}/`" in files, (stage.name, missing)
+        assert [o.path for o in stage.outputs if f"| `{o.path}` | {o.help}" not in files] == []
+        assert [f.path for o in stage.outputs for f in o.fields if f"| `{f.path}` |" not in files] == []
 
 
 def test_costs_are_listed_by_rising_cost_without_ablations():
@@ -30,15 +46,39 @@ def test_costs_are_listed_by_rising_cost_without_ablations():
     assert table[5].startswith("Medians of 1, from the clip to the maps, on 2 cores; other work kept 0.0 cores")
 
 
-@pytest.mark.parametrize("stage", load_pipeline().steps)
-def test_every_file_of_every_stage_is_explained(stage):
-    text = (Path(README).parent / "docs" / "files.md").read_text(encoding="utf-8")
-    for output in importlib.import_module(f"stages.{stage}").STAGE.outputs:
-        assert any(f"`{output.path.replace('*', number)}`" in text for number in ("*", "%06d", "%04d")), output.path
+def links_of(path):
+    return _LINK.findall(_FENCED.sub("", path.read_text(encoding="utf-8")))
 
 
-def test_every_local_link_leads_somewhere():
-    links = re.findall(r"\]\((?!https?:)([^)#]+)\)", README.read_text(encoding="utf-8"))
-    assert links
-    for link in links:
-        assert (Path(README).parent / link).exists(), link
+def anchors_of(path):
+    """As code hosts make them of headings: lower case, spaces to hyphens, no other punctuation."""
+    headings = _HEADING.findall(_FENCED.sub("", path.read_text(encoding="utf-8")))
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
+def test_every_local_link_leads_somewhere(path):
+    for link in links_of(path):
+        name, _, anchor = link.partition("#")
+        target = (path.parent / name).resolve() if name else path
+        assert target.exists(), f"{path.name}: {link}"
+        assert not anchor or anchor in anchors_of(target), f"{path.name}: {link}"
+
+
+def test_the_readme_links_to_every_document():
+    linked = {link.partition("#")[0] for link in links_of(README)}
+    assert [path.name for path in sorted(DOCS.glob("*.md")) if f"docs/{path.name}" not in linked] == []
+
+
+def test_the_readme_is_short_and_names_what_a_newcomer_types():
+    text = README.read_text(encoding="utf-8")
+    assert 8_000 <= len(text.encode()) <= 10_000
+    for command in ("make demo", "make test ", "make test-all", "limn new", "limn run", "limn report"):
+        assert command in text, command
+
+
+def test_the_citation_is_of_this_version():
+    citation = yaml.safe_load((README.parent / "CITATION.cff").read_text(encoding="utf-8"))
+    project = tomllib.loads((README.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert (citation["version"], citation["license"]) == (project["version"], project["license"])
+    assert {"cff-version", "message", "title", "authors"} <= citation.keys()

@@ -13,7 +13,7 @@ Resumes  rows of the same code, subject, parameters and threads are kept, and fi
          at any time, or let it end by itself with --minutes (no case begins later).
 Cases    quick: draft and standard, ablations of draft, the published solver cut short, Mitsuba for two minutes: 15
          minutes for the demo subject on two cores. all: fine as well, ablations of standard, longer runs of the others.
-         Mitsuba 3 is optional (pip install mitsuba; it also needs LLVM, see docs/chart.md).
+         Mitsuba 3 is optional (pip install mitsuba; it also needs LLVM, see docs/accuracy.md).
 """
 
 from __future__ import annotations
