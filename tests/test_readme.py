@@ -1,5 +1,6 @@
 """The README and docs/ say what the code says, and every link leads somewhere."""
 
+import importlib.util
 import re
 import tomllib
 
@@ -68,6 +69,28 @@ def test_every_local_link_leads_somewhere(path):
 def test_the_readme_links_to_every_document():
     linked = {link.partition("#")[0] for link in links_of(README)}
     assert [path.name for path in sorted(DOCS.glob("*.md")) if f"docs/{path.name}" not in linked] == []
+
+
+@pytest.mark.parametrize("path", [path for path in TEXTS if path.name != "CHANGELOG.md"], ids=lambda path: path.name)
+def test_what_the_documents_name_is_there(path):
+    """Modules that are run, commands of limn, parameters, presets, files of the repository."""
+    text, pipeline = path.read_text(encoding="utf-8"), load_pipeline()
+    modules = set(re.findall(r"python -m ((?:tools|stages)(?:\.[a-z_]+)+)", text))
+    assert [name for name in modules if importlib.util.find_spec(name) is None] == []
+    commands = set(re.findall(r"^    limn ([a-z]+)", text, re.MULTILINE)) | set(re.findall(r"`limn ([a-z]+)", text))
+    assert commands <= set(limn_commands()), commands - set(limn_commands())
+    parameters = {f"{stage.name}.{p.name}" for stage in pipeline.stages.values() for p in stage.parameters}
+    assert set(re.findall(rf"\b((?:{'|'.join(pipeline.stages)})\.[a-z][a-z_]+)=", text)) <= parameters
+    assert set(re.findall(r"--preset ([a-z]+)", text)) <= set(pipeline.presets)
+    files = re.findall(r"`((?:shared|stages|tools|tests|profiles|container|docs)/[\w/.]*)`", text)
+    assert [name for name in files if not (README.parent / name).exists()] == []
+
+
+def limn_commands():
+    from tools.limn import make_parser
+
+    actions = make_parser()._actions
+    return next(action.choices for action in actions if isinstance(action.choices, dict))
 
 
 def test_the_readme_is_short_and_names_what_a_newcomer_types():
