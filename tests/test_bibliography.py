@@ -2,13 +2,13 @@
 
 import ast
 import re
-from pathlib import Path
 
 import pytest
 
 from shared.report.references import REFERENCES
+from tools.readme import README
 
-REPOSITORY = Path(__file__).resolve().parents[1]
+REPOSITORY = README.parent
 FILES = sorted(path for package in ("shared", "stages", "tools") for path in (REPOSITORY / package).rglob("*.py")
                if path.name != "references.py")
 _CITED = re.compile(r"\[([A-Z][a-z]+(?:19|20)\d\d)\]")

@@ -8,6 +8,7 @@ import pytest
 from shared.contract.fields import Field, below, field_faults, written_fields
 from shared.contract.pipeline import load_pipeline
 from shared.contract.records import MANIFEST, PROVENANCE
+from tools.readme import README
 
 FIELDS = (
     Field("name", "Name.", "text"),
@@ -87,6 +88,11 @@ ELSEWHERE = {
     "test_solve_shape": {"solve.json: shape.fitted"},
 }
 """Tests that compare what the tiny run has no occasion to write."""
+
+
+def test_the_tests_named_here_compare_fields():
+    files = {path.stem: path for path in (README.parent / "tests").rglob("test_*.py")}
+    assert [name for name in ELSEWHERE if "field_faults(" not in files[name].read_text(encoding="utf-8")] == []
 
 
 def read(path):
