@@ -71,10 +71,19 @@ class Samples:
 
 
 class SurfaceViewer:
-    """A mesh as cameras see it: vertex visibility by rays, eroded by a margin on the surface."""
+    """A mesh as cameras see it: vertex visibility by rays, eroded by a margin on the surface.
 
-    def __init__(self, mesh: Mesh, scene: RayScene, margin_mm: float = 2.0, offset: float = 0.05):
+    layout [V, 3]: where its vertices lie when some of them are chosen to stand for the surface. Of a refined mesh these
+    are the places before: its own differ by what the light was solved to, and one that crosses a cell's edge would
+    draw all the others anew.
+    """
+
+    def __init__(
+        self, mesh: Mesh, scene: RayScene, margin_mm: float = 2.0, offset: float = 0.05,
+        layout: np.ndarray | None = None,
+    ):
         self.mesh, self.scene, self.offset = mesh, scene, offset
+        self.layout = mesh.vertices if layout is None else layout
         self.error_mm, self.least_cosine = 0.0, MINIMUM_VIEW_COSINE
         self.normals = vertex_normals(mesh.vertices, mesh.faces)
         self._vertices, self._normals = mesh.vertices, self.normals
@@ -87,9 +96,9 @@ class SurfaceViewer:
         self._adjacency = adjacency + adjacency.T
 
     @classmethod
-    def of(cls, mesh: Mesh) -> SurfaceViewer:
+    def of(cls, mesh: Mesh, layout: np.ndarray | None = None) -> SurfaceViewer:
         """With a scene of the mesh alone."""
-        return cls(mesh, RayScene(mesh.vertices, mesh.faces))
+        return cls(mesh, RayScene(mesh.vertices, mesh.faces), layout=layout)
 
     def within_rim(self, error_mm: float) -> SurfaceViewer:
         """The same for a surface that may be off by error_mm: it leaves out what is so close to the rim that the

@@ -102,7 +102,7 @@ def spread_vertices(vertices: np.ndarray, count: int, allowed: np.ndarray | None
     size = np.bincount(inverse)
     mean = np.stack([np.bincount(inverse, points[:, k]) / size for k in range(3)], axis=1)
     distance = np.rint(((points - mean[inverse]) ** 2).sum(1) / (1e-3 * edge) ** 2)
-    drawn = np.arange(len(points), dtype=np.uint64) * np.uint64(2654435761) % np.uint64(1 << 32)
+    drawn = candidates.astype(np.uint64) * np.uint64(2654435761) % np.uint64(1 << 32)
     order = np.lexsort((drawn, distance, inverse))
     first = np.searchsorted(inverse[order], np.arange(len(cells)))
     return np.sort(candidates[order[first]])
@@ -129,10 +129,11 @@ def nearest_points(target: Points, source: Points) -> np.ndarray:
     return cKDTree(position_and_normal(source)).query(position_and_normal(target))[1]
 
 
-def bounce_nodes(mesh: Mesh, count: int) -> Nodes:
-    """Spreads about count nodes over the mesh and assigns each face to the nearest one."""
+def bounce_nodes(mesh: Mesh, count: int, layout: np.ndarray | None = None) -> Nodes:
+    """Spreads about count nodes over the mesh and assigns each face to the nearest one. layout [V, 3]: where the
+    vertices lie for the spreading, None: where they are."""
     normals = vertex_normals(mesh.vertices, mesh.faces)
-    index = spread_vertices(mesh.vertices, count)
+    index = spread_vertices(mesh.vertices if layout is None else layout, count)
     points = Points(mesh.vertices[index], normals[index])
     corners = mesh.vertices[mesh.faces], normals[mesh.faces]
     centres = Points(corners[0].mean(1), normalised(corners[1].mean(1)))

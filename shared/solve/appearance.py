@@ -64,7 +64,7 @@ class Settings:
     fit_roughness: bool = True
     local_roughness: bool = True
     specular_prior: tuple[float, float] = (0.7, 0.25)
-    precision: tuple[int, float] = (40, 0.001)
+    precision: tuple[int, float] = (60, 0.0005)
 
     def light_moves(self, moves: str) -> str:
         """What moves against the light: a lamp at the camera goes with it, so that the head moves in any capture."""

@@ -89,7 +89,7 @@ def frames_of_lights(light_index: np.ndarray | None, count: int) -> list[np.ndar
 def set_scenery(viewer: SurfaceViewer, sizes: Sizes, visibility: bool = True) -> Scenery:
     """Directions and bounce nodes of a mesh, traced; visibility off: see trace_transfer."""
     directions = fibonacci_sphere(sizes.directions)
-    nodes = bounce_nodes(viewer.mesh, sizes.nodes)
+    nodes = bounce_nodes(viewer.mesh, sizes.nodes, viewer.layout)
     node_transfer = trace_transfer(viewer.scene, nodes.points, nodes, directions, visibility=visibility)
     return Scenery(viewer.scene, directions, nodes, node_transfer, visibility)
 
@@ -151,7 +151,7 @@ def build_capture(
     or deep inside the mesh are left out.
     """
     front = allowed & face_front(viewer, camera_from_head, 0.2)
-    index = spread_vertices(viewer.mesh.vertices, count, front)
+    index = spread_vertices(viewer.layout, count, front)
     samples = gather_samples(viewer, index, pictures, camera_from_head, intrinsics)
     # Of very few frames, chosen to cover the face, no point is seen in all.
     least = min(MINIMUM_FRAMES, -(-2 * int(fitted.sum()) // 3))

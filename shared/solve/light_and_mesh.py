@@ -12,7 +12,7 @@ from shared.solve.capture import Capture, Scenery, set_scenery
 from shared.solve.fit_appearance import Solution, fit_appearance
 from shared.solve.inverse_problem import InverseInputs, InverseSettings, capture_skin, frames_of
 from shared.solve.ladder_clip import climb
-from shared.solve.reshape import reshape
+from shared.solve.reshape import reshape, subdivided_to
 from shared.solve.shape import Reflectance
 
 
@@ -49,7 +49,7 @@ def solve_light(
         known = Reflectance.of(solution, scenery)
         frames = frames_of(inputs, settings, settings.shape.frames, fitted)
         reshaped = reshape(inputs, frames, known, settings.appearance, settings.sizes, settings.shape, progress, note)
-        viewer_then = SurfaceViewer.of(reshaped.mesh)
+        viewer_then = SurfaceViewer.of(reshaped.mesh, subdivided_to(inputs.mesh, reshaped.mesh).vertices)
         scenery_then = set_scenery(viewer_then, settings.sizes, settings.appearance.visibility)
         more = viewer_then, scenery_then, fitted, chart, progress, note, solution
         then, capture_then = _fit_light(reshaped, settings, *more)

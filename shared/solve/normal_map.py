@@ -65,13 +65,18 @@ class ReliefEquations:
     hessian: np.ndarray
     gradient: np.ndarray
 
-    def confirmed(self, turn: np.ndarray) -> tuple[float, float]:
-        """What share of the turns [T, 2] of all texels, 0 to 1, lowers the cost most, and by how much that is."""
-        (a11, a12, a22), (k1, k2) = self.hessian.T.astype(np.float64), turn.T
+    def confirmed(self, turn: np.ndarray, patch: np.ndarray) -> tuple[float, float]:
+        """What share of the turns [T, 2] of all texels, 0 to 1, lowers the cost, and by how much.
+
+        patch [T] int: texels whose errors go together. What they say of the slope scatters; of it one standard
+        deviation is taken off, so that relief which noise alone would confirm as often as not is none.
+        """
+        (a11, a12, a22), (k1, k2) = self.hessian.T.astype(np.float64), turn.T.astype(np.float64)
         curvature = float((a11 * k1**2 + 2.0 * a12 * k1 * k2 + a22 * k2**2).sum())
-        slope = float((self.gradient * turn).sum())
-        share = float(np.clip(-slope / max(curvature, 1e-9), 0.0, 1.0))
-        return share, -share * (slope + 0.5 * share * curvature)
+        slopes = np.bincount(patch, (self.gradient * turn).sum(1, dtype=np.float64))
+        descent = max(-float(slopes.sum()) - float(np.linalg.norm(slopes)), 0.0)
+        share = min(descent / max(curvature, 1e-9), 1.0)
+        return share, share * (descent - 0.5 * share * curvature)
 
 
 @dataclass(frozen=True)
@@ -141,7 +146,7 @@ class NormalPass:
         equations = self.pooled(self.accumulate(fitted[spread_frames(len(fitted), FRAMES)]), pool)
         unseen = self.accumulate(held_out[spread_frames(len(held_out), FRAMES // 4)])
         turns = [most_likely_turns(equations, prior) for prior in PRIORS]
-        shares, gains = zip(*(unseen.confirmed(turn) for turn in turns), strict=True)
+        shares, gains = zip(*(unseen.confirmed(turn, self.corner) for turn in turns), strict=True)
         best = int(np.argmax(gains))
         turn = turns[best] * np.float32(shares[best])
         angle = np.degrees(np.arctan(np.linalg.norm(turn[self.material.information > 1.0], axis=1)))

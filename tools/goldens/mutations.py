@@ -64,7 +64,7 @@ MUTATIONS = (
     Mutation("shape: smoothness", "inverse_render", "stages/inverse_render.py", '"shape_smoothness", float, 19.0',
              '"shape_smoothness", float, 19.95'),
     Mutation("light step: stopping bound", "inverse_render", "shared/solve/appearance.py",
-             "precision: tuple[int, float] = (40, 0.001)", "precision: tuple[int, float] = (40, 0.00105)"),
+             "precision: tuple[int, float] = (60, 0.0005)", "precision: tuple[int, float] = (60, 0.000525)"),
     Mutation("texture: prior's spread", "inverse_render", "shared/solve/texture.py", "PRIOR_SPREAD = 0.3",
              "PRIOR_SPREAD = 0.315"),
     Mutation("views: studio lamps", "export_usd", "shared/studio_lights.py", "share = 0.5 + 0.5 *",
