@@ -19,7 +19,7 @@ from toy_capture import (
 from shared.envmap import cube_directions
 from shared.lobes import LobeTable, specular_reflection
 from shared.shading import light_along
-from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.appearance import AppearanceSettings, AppearanceSolver
 from shared.solve.gloss_fit import GlossFit
 from shared.solve.light_step import LightStep
 from shared.transfer import nearest_points
@@ -236,7 +236,7 @@ def test_light_between_surfaces_that_send_everything_on_comes_to_an_end(truth):
     capture = truth[0]
     count = len(capture.nodes.points)
     closed = replace(capture.node_transfer, bounce=np.full((count, count), 1.0 / count, np.float32))
-    solver = AppearanceSolver(replace(capture, node_transfer=closed), Settings(specular=False))
+    solver = AppearanceSolver(replace(capture, node_transfer=closed), AppearanceSettings(specular=False))
     solver.state.node_albedo[:] = 1.0
     solver.bake()
     assert torch.isfinite(solver.baked).all() and (solver.baked >= solver.direct).all()

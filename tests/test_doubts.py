@@ -10,12 +10,12 @@ from toy_head import toy_head
 
 from shared.errors import InputError
 from shared.io.images import write_exr
-from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.appearance import AppearanceSettings, AppearanceSolver
 from shared.solve.doubts import by_orientation, doubts_about, face_regions, signs_of, unlikely_colour
 from shared.solve.fit_appearance import fit_appearance
 from stages.inverse_render import check
 
-MATTE = Settings(resolutions=(6,), steps=5, specular=False, noise=(0.003, 0.01))
+MATTE = AppearanceSettings(resolutions=(6,), steps=5, specular=False, noise=(0.003, 0.01))
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from shared.geometry import Similarity, project, rigid, rotation_from_vector
 from shared.mesh import interpolate, vertex_normals
 from shared.solve import joint_clips
 from shared.solve.joint_clips import join_clips
-from shared.texture_match import Matches, MeanTexture, match_textures
+from shared.texture_match import ClipTexture, Matches, match_textures
 
 LENS = np.array([[900.0, 0, 128], [0, 900.0, 128], [0, 0, 1]])
 HEAD = toy_head(4).mesh(np.zeros(2), np.zeros(1))
@@ -94,16 +94,16 @@ def test_mean_textures_show_the_same_skin_where_they_are_shifted():
     lit = moved * np.linspace(0.3, 1.2, size)[:, None]
     weight = np.full((size, size), 5.0)
     weight[:, 150:] = 0.0
-    textures = [MeanTexture(plane, np.repeat(image[..., None], 3, 2), weight) for image in (skin, lit)]
+    textures = [ClipTexture(plane, np.repeat(image[..., None], 3, 2), weight) for image in (skin, lit)]
     found = match_textures(*textures)
     here, there = found.first, found.second
     assert 0.5 * size * 150 < len(here) <= size * 150
     texel = np.ptp(plane.vertices, axis=0).max() / size
     assert np.median(np.linalg.norm(there - here, axis=1)) == pytest.approx(2.5 * texel, rel=0.1)
-    blind = MeanTexture(plane, textures[1].mean, np.zeros((size, size)))
+    blind = ClipTexture(plane, textures[1].mean, np.zeros((size, size)))
     assert len(match_textures(textures[0], blind)) == 0
     other = cv2.GaussianBlur(np.random.default_rng(5).normal(size=(size, size)), (0, 0), 2.0)
-    stranger = MeanTexture(plane, np.repeat(0.3 * np.exp(1.5 * other)[..., None], 3, 2), weight)
+    stranger = ClipTexture(plane, np.repeat(0.3 * np.exp(1.5 * other)[..., None], 3, 2), weight)
     assert len(match_textures(textures[0], stranger)) < 0.1 * len(here)
 
 

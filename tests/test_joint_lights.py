@@ -11,7 +11,7 @@ from shared.envmap import cube_directions, frame_lookup
 from shared.geometry import rotation_from_vector
 from shared.mesh import normalised
 from shared.shading import light_along
-from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.appearance import AppearanceSettings, AppearanceSolver
 from shared.solve.capture import hold_out, spread_frames
 from shared.solve.fit_appearance import fit_appearance
 from shared.solve.light import LightPriors
@@ -21,7 +21,7 @@ from shared.solve.light_trust import weigh_samples
 from shared.solve.scale import scale_prior, settle_scale
 from shared.solve.texture import CORRELATED_FRAMES, Noise, NormalEquations, weigh_lights
 
-SETTINGS = Settings(resolutions=(8,), steps=12, noise=(0.003, 0.01), local_roughness=False)
+SETTINGS = AppearanceSettings(resolutions=(8,), steps=12, noise=(0.003, 0.01), local_roughness=False)
 
 
 def hard_lamp(directions):

@@ -24,7 +24,7 @@ from shared.errors import InputError
 from shared.report.gather import ladder_record
 from shared.report.model_sections import climbed_table
 from shared.solve import ladder_clip
-from shared.solve.appearance import Settings
+from shared.solve.appearance import AppearanceSettings
 from shared.solve.fit_appearance import Solution
 from shared.solve.inverse_parameters import read_forced, read_settings
 from shared.solve.inverse_problem import InverseSettings
@@ -34,7 +34,7 @@ from shared.solve.ladder_gloss import VARIATIONS, Gloss, GlossLadder, segments_a
 from shared.solve.shape import ShapeSettings
 from stages.inverse_render import STAGE
 
-CAREFUL = Settings(resolutions=(8, 16), noise=(0.003, 0.01))
+CAREFUL = AppearanceSettings(resolutions=(8, 16), noise=(0.003, 0.01))
 
 
 def climbed(capture, settings=CAREFUL, **rungs):
@@ -90,7 +90,7 @@ def test_every_rung_is_on_the_record_with_its_error_and_seconds(glossy):
 def gloss_of(capture, segment, **rungs):
     """The variation of gloss that is climbed to under the true light, and the record."""
     model, records = Model("bounces", "one_value", "cubemap_16"), []
-    settings = model.applied(Settings(noise=(0.003, 0.01), roughness=ROUGHNESS))
+    settings = model.applied(AppearanceSettings(noise=(0.003, 0.01), roughness=ROUGHNESS))
     state = solver_under_true_light(capture).state
     trial = Trial(model, Solution(state, (), 0.0, 0.0), np.zeros(0), 0.0)
     allowed = {"specular": VARIATIONS, "roughness": VARIATIONS} | rungs
@@ -195,25 +195,25 @@ def test_a_fall_within_its_standard_error_does_not_serve():
 
 
 def test_settings_bound_the_ladder_and_force_its_rungs():
-    free = allowed_rungs(Settings())
+    free = allowed_rungs(AppearanceSettings())
     assert free["visibility"] == ("off", "on", "bounces") and free["specular"] == ("none", "one_value")
     assert free["light"][0] == "harmonics_2" and free["light"][-1] == "cubemap_16"
-    assert allowed_rungs(Settings(bounce=False))["visibility"] == ("off", "on")
-    assert allowed_rungs(Settings(visibility=False))["visibility"] == ("off",)
-    assert allowed_rungs(Settings(specular=False))["specular"] == ("none",)
-    assert allowed_rungs(Settings(resolutions=(4,)))["light"][-2:] == ("harmonics_4", "cubemap")
-    assert allowed_rungs(Settings(light_model="sun_sky"))["light"] == ("sun_sky",)
-    assert allowed_rungs(Settings(), frozenset({"light", "specular"})) == free | {
+    assert allowed_rungs(AppearanceSettings(bounce=False))["visibility"] == ("off", "on")
+    assert allowed_rungs(AppearanceSettings(visibility=False))["visibility"] == ("off",)
+    assert allowed_rungs(AppearanceSettings(specular=False))["specular"] == ("none",)
+    assert allowed_rungs(AppearanceSettings(resolutions=(4,)))["light"][-2:] == ("harmonics_4", "cubemap")
+    assert allowed_rungs(AppearanceSettings(light_model="sun_sky"))["light"] == ("sun_sky",)
+    assert allowed_rungs(AppearanceSettings(), frozenset({"light", "specular"})) == free | {
         "light": ("cubemap_16",), "specular": ("one_value",)}
 
 
 def test_a_model_becomes_the_solvers_settings():
-    settings = Model("on", "none", "harmonics_4").applied(Settings())
+    settings = Model("on", "none", "harmonics_4").applied(AppearanceSettings())
     assert settings.visibility and not settings.bounce and not settings.specular
     assert (settings.light_model, settings.resolutions) == ("harmonics_4", (8,))
-    camera = Model("bounces", "one_value", "camera").applied(Settings(light_model="camera"))
+    camera = Model("bounces", "one_value", "camera").applied(AppearanceSettings(light_model="camera"))
     assert (camera.light_model, camera.resolutions) == ("camera", (16,))
-    coarse = Model("off", "none", "cubemap").applied(Settings(resolutions=(4,)))
+    coarse = Model("off", "none", "cubemap").applied(AppearanceSettings(resolutions=(4,)))
     assert (coarse.light_model, coarse.resolutions) == ("cubemap", (4,))
 
 
@@ -231,7 +231,7 @@ def noisy(capture, sigma):
     return replace(capture, samples=replace(capture.samples, colours=colours.astype(np.float32)))
 
 
-MATTE = Settings(resolutions=(8,), light_model="harmonics_2", specular=False, noise=(0.003, 0.01))
+MATTE = AppearanceSettings(resolutions=(8,), light_model="harmonics_2", specular=False, noise=(0.003, 0.01))
 
 
 def clip_of(capture):

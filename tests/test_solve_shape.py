@@ -17,10 +17,10 @@ from shared.geometry import projection_slope, rigid, rotation_from_vector
 from shared.mesh import Mesh, interpolate, normalised, tangent_frames, vertex_normals
 from shared.raycast import RayScene, camera_hits
 from shared.shading import Material, VertexShading
-from shared.solve.appearance import Settings
+from shared.solve.appearance import AppearanceSettings
 from shared.solve.capture import Sizes, set_scenery
 from shared.solve.light_and_mesh import judge_shape
-from shared.solve.shape import Reflectance, ShapeClip, ShapeSettings, ShapeSolver, Surface
+from shared.solve.shape import Reflectance, ShapeClip, ShapedSurface, ShapeSettings, ShapeSolver
 from shared.solve.shape_equations import EquationSettings, excess
 from shared.solve.shape_step import TrackPoints, large_step_metric, normal_turns, solve_offsets
 from shared.solve.shape_terms import Reflections, shading_terms
@@ -100,7 +100,7 @@ def toy():
 
 
 def solver_of(toy, **changes):
-    return ShapeSolver(toy.clip, toy.reflectance, Settings(), SIZES, ShapeSettings(**changes))
+    return ShapeSolver(toy.clip, toy.reflectance, AppearanceSettings(), SIZES, ShapeSettings(**changes))
 
 
 def test_projection_slope_is_the_derivative_of_the_projection():
@@ -246,7 +246,7 @@ def test_the_shape_goes_on_past_one_worse_step_and_keeps_the_best(toy, monkeypat
     def examine(mesh, shaped, traced):
         value = judged[height(mesh)]
         equations = SimpleNamespace(judged=value, fitted=value, held_out=value)
-        return Surface(mesh, np.arange(3), np.zeros((3, 2, 3)), equations)
+        return ShapedSurface(mesh, np.arange(3), np.zeros((3, 2, 3)), equations)
 
     normals = vertex_normals(toy.start.vertices, toy.start.faces)
     monkeypatch.setattr(solver, "examine", examine)

@@ -10,7 +10,7 @@ from shared.geometry import project, rigid, vector_from_rotation
 from shared.io.arrays import read_json, write_json
 from tools import stress
 from tools.stress_camera import Sensor, compressed, defocused, drift, photograph, shaken, smeared
-from tools.stress_dials import DIALS, Case, Dial
+from tools.stress_dials import DIALS, Dial, StressCase
 from tools.stress_judge import FAILED, LIMITS, RIGHT, SAID, SILENT, WARNED, judge
 from tools.stress_subject import sliding_landmarks, wrong_poses
 from tools.stress_takes import Take, smile_of
@@ -150,18 +150,18 @@ def test_the_dials_are_told_apart_and_grow():
     assert len({dial.name for dial in DIALS}) == len(DIALS)
     for dial in DIALS:
         assert list(dial.severities) == sorted(dial.severities) and dial.severities[0] > 0
-        digests = {dial.make(severity).digest for severity in dial.severities} | {Case().digest}
+        digests = {dial.make(severity).digest for severity in dial.severities} | {StressCase().digest}
         assert len(digests) == len(dial.severities) + 1, dial.name
 
 
 def test_a_case_is_known_by_all_that_decides_it():
-    assert Case().digest == Case(mix=((Take(), 1.0),), sensor=Sensor()).digest
-    assert len({Case().digest, Case(focal_gain=1.1).digest, Case(sensor=Sensor(jpeg=50)).digest,
-                Case(mix=((Take(seed=1), 1.0),)).digest, Case(mix=((Take(), 0.5),)).digest}) == 5
+    assert StressCase().digest == StressCase(mix=((Take(), 1.0),), sensor=Sensor()).digest
+    assert len({StressCase().digest, StressCase(focal_gain=1.1).digest, StressCase(sensor=Sensor(jpeg=50)).digest,
+                StressCase(mix=((Take(seed=1), 1.0),)).digest, StressCase(mix=((Take(), 0.5),)).digest}) == 5
 
 
-TOY = (Dial("toy", "a toy", "units", (1.0, 2.0), lambda s: Case(focal_gain=1.0 + s), "toy"),
-       Dial("other", "another", "units", (1.0,), lambda s: Case(keep=5), "other"))
+TOY = (Dial("toy", "a toy", "units", (1.0, 2.0), lambda s: StressCase(focal_gain=1.0 + s), "toy"),
+       Dial("other", "another", "units", (1.0,), lambda s: StressCase(keep=5), "other"))
 
 
 @pytest.fixture
@@ -231,6 +231,6 @@ def test_a_row_tells_what_was_run(tmp_path, monkeypatch):
 
     monkeypatch.setattr("tools.stress_subject.make_subject", refused)
     (tmp_path / "rows").mkdir()
-    stress.do_case("toy", Case(), tmp_path, "code")
-    kept = read_json(stress.row_file(tmp_path, Case()))
+    stress.do_case("toy", StressCase(), tmp_path, "code")
+    kept = read_json(stress.row_file(tmp_path, StressCase()))
     assert kept["exit"] == 2 and "absent.mp4" in kept["message"] and kept["code"] == "code"

@@ -13,13 +13,13 @@ from shared.lobes import LobeTable, specular_reflection
 from shared.mesh import normalised
 from shared.raycast import RayScene
 from shared.shading import light_along
-from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.appearance import AppearanceSettings, AppearanceSolver
 from shared.solve.capture import Capture
 from shared.transfer import bounce_nodes, irradiance, mesh_points, node_radiosity, trace_transfer
 
 FRAMES, ROUGHNESS, SPECULAR, NOISE = 14, 0.4, 0.7, 0.002
 DIRECTIONS = fibonacci_sphere(256)
-MATTE = Settings(resolutions=(6,), steps=4, specular=False, noise=(0.003, 0.01))
+MATTE = AppearanceSettings(resolutions=(6,), steps=4, specular=False, noise=(0.003, 0.01))
 
 
 def true_light(directions):
@@ -123,7 +123,7 @@ def solver_of(capture, settings=MATTE):
 
 def solver_under_true_light(capture):
     """All unknowns but the roughness as they are; baked."""
-    solver = AppearanceSolver(capture, Settings(resolutions=(16,), noise=(0.003, 0.01), roughness=ROUGHNESS))
+    solver = AppearanceSolver(capture, AppearanceSettings(resolutions=(16,), noise=(0.003, 0.01), roughness=ROUGHNESS))
     solver.state.params, solver.state.specular = np.log(true_light(cube_directions(16))), SPECULAR
     solver.state.node_albedo = true_albedo(capture.nodes.points.positions)
     solver.state.albedo = true_albedo(capture.points.positions)

@@ -34,8 +34,8 @@ from shared.render import SurfaceMaps, render_frame
 from shared.shading import light_along
 from shared.solve.capture import Scenery, Sizes, face_front, set_scenery
 from shared.solve.reference_raster import Raster
-from shared.solve.reference_shade import Sampling, Shader, Texture
-from shared.solve.views import Camera, orbit_camera
+from shared.solve.reference_shade import Sampling, Shader, TorchMaterial
+from shared.solve.views import ViewCamera, orbit_camera
 from shared.studio_lights import STUDIO_LIGHTS, studio_light
 from shared.transfer import Transfer, irradiance, mesh_points, node_radiosity
 from tools.peer_mitsuba import ALL_BOUNCES, DIRECT, ONE_BOUNCE, Coat, path_trace
@@ -69,11 +69,11 @@ class _Frame:
 
 
 @dataclass(frozen=True)
-class Stage:
+class TracedView:
     """A mesh before one camera under one light, traced once: what the transfer solver shades with."""
 
     viewer: SurfaceViewer
-    camera: Camera
+    camera: ViewCamera
     scenery: Scenery
     index: np.ndarray
     transfer: Transfer
@@ -81,7 +81,7 @@ class Stage:
     latlong: np.ndarray
 
     @classmethod
-    def of(cls, mesh: Mesh, light: np.ndarray, pixels: int, sizes: Sizes = SIZES) -> Stage:
+    def of(cls, mesh: Mesh, light: np.ndarray, pixels: int, sizes: Sizes = SIZES) -> TracedView:
         """light: lat-long [H, 2 H, 3] in the mesh's space; both renderers see it through the same coarse cubemap."""
         viewer, camera = (
             SurfaceViewer.of(mesh),
@@ -123,7 +123,7 @@ class Stage:
         points = raster.points(vertices, normals, camera.camera_from_head, pixels, hits.face.ravel()[pixels])
         shader = Shader(PUBLISHED_RESOLUTION, Sampling(samples, samples, SPLIT_SAMPLES))
         even = torch.ones(len(pixels))
-        texture = Texture(
+        texture = TorchMaterial(
             torch.tensor(coat.albedo).expand(len(pixels), 3), coat.specular_intensity * even, coat.roughness * even
         )
         light = view(cube_from_latlong(self.latlong, PUBLISHED_RESOLUTION))
@@ -186,7 +186,7 @@ MESHES: dict[str, Callable[[], Mesh]] = {"head": head, "statue": statue}
 
 def measure(
     name: str,
-    stage: Stage,
+    stage: TracedView,
     samples: int,
     keep: Callable[[str, np.ndarray, np.ndarray], None],
     roughnesses: Sequence[float] = ROUGHNESSES,
@@ -253,7 +253,7 @@ def main(arguments: list[str] | None = None) -> int:
     rows = []
     for name in options.mesh:
         sizes = replace(SIZES, directions=options.directions)
-        stage = Stage.of(MESHES[name](), studio_light(options.light), options.pixels, sizes)
+        stage = TracedView.of(MESHES[name](), studio_light(options.light), options.pixels, sizes)
         own = measure(name, stage, options.samples, keep)
         for row in own:
             print(" ".join(f"{v:.4f}" if isinstance(v, float) else str(v) for v in row.values()), flush=True)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from shared.contract.limits import EXPECTED_MB, EXPECTED_MINUTES
-from shared.contract.needs import Scale, amount, measured_scale
+from shared.contract.needs import WorkSize, amount, measured_scale
 
 KINDS = ("mem_mb", "runtime")
 KEPT_FREE = 0.1
@@ -20,7 +20,7 @@ def booked(needs: Mapping[str, Mapping[str, float]], kind: str, scale: Mapping[s
 
     limit: no more than that, since a job that asks for more than there is would wait for ever. overhead: added once.
     """
-    needed = attempt * amount(needs, kind, measured_scale(run, Scale(**scale))) + overhead
+    needed = attempt * amount(needs, kind, measured_scale(run, WorkSize(**scale))) + overhead
     return needed if limit is None else min(needed, limit)
 
 

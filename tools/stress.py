@@ -21,7 +21,7 @@ from shared.contract.pipeline import REPOSITORY, load_pipeline
 from shared.contract.source import read_declaration
 from shared.errors import InputError
 from shared.io.arrays import read_json, write_json
-from tools.stress_dials import DIALS, Case, Dial
+from tools.stress_dials import DIALS, Dial, StressCase
 from tools.stress_judge import FAILED, SILENT, judge
 from tools.stress_table import write_tables
 
@@ -35,17 +35,17 @@ def code_version() -> str:
     return ".".join(str(version) for version in (VERSION, *(read_declaration(path).version for path in stages)))
 
 
-def cases_of(dials: list[Dial]) -> list[tuple[str, Case]]:
+def cases_of(dials: list[Dial]) -> list[tuple[str, StressCase]]:
     """(name, case), the unspoilt one first, then every dial's most severe, last the mildest ones."""
     most = max(len(dial.severities) for dial in dials)
-    cases = [("unspoilt", Case())]
+    cases = [("unspoilt", StressCase())]
     for step in range(1, most + 1):
         cases += [(f"{dial.name}_{dial.severities[-step]:g}", dial.make(dial.severities[-step]))
                   for dial in dials if step <= len(dial.severities)]
     return cases
 
 
-def do_case(name: str, case: Case, work: Path, version: str) -> None:
+def do_case(name: str, case: StressCase, work: Path, version: str) -> None:
     """Makes the subject, runs Limn, keeps the row."""
     from tools.stress_run import run_case
     from tools.stress_subject import make_subject
@@ -59,12 +59,12 @@ def do_case(name: str, case: Case, work: Path, version: str) -> None:
     print(f"{name}: {state}; {made:.0f} + {row['seconds']:.0f} s; {len(row['warnings'])} warnings", flush=True)
 
 
-def row_file(work: Path, case: Case) -> Path:
+def row_file(work: Path, case: StressCase) -> Path:
     """Where the row of a case lies."""
     return work / "rows" / f"{case.digest}.json"
 
 
-def known_row(work: Path, case: Case) -> dict | None:
+def known_row(work: Path, case: StressCase) -> dict | None:
     """A case's row, of whatever code."""
     path = row_file(work, case)
     return read_json(path) if path.exists() else None
@@ -86,7 +86,7 @@ def run_dials(dials: list[Dial], work: Path, minutes: float, keep_old: bool) -> 
 
 def verdicts(work: Path) -> list[dict]:
     """A row for each dial and severity that has been run, with its verdict."""
-    zero = known_row(work, Case())
+    zero = known_row(work, StressCase())
     if zero is None or zero["exit"]:
         raise InputError("the unspoilt case has no result", where=str(work), mend="run without --table first")
     rows = []

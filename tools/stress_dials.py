@@ -19,7 +19,7 @@ from tools.synthesize import SENSOR_MM
 
 
 @dataclass(frozen=True)
-class Case:
+class StressCase:
     """mix: takes with their gains, added up. focal_gain: stated focal length over the true one.
 
     pose_error_deg: of poses that come with the subject and are held. landmark_slide: how far landmarks that come with
@@ -50,20 +50,20 @@ class Dial:
     what: str
     unit: str
     severities: tuple[float, ...]
-    make: Callable[[float], Case]
+    make: Callable[[float], StressCase]
     says: str
 
 
-def _seen(**look: float) -> Case:
-    return Case(mix=((Take(**look), 1.0),))
+def _seen(**look: float) -> StressCase:
+    return StressCase(mix=((Take(**look), 1.0),))
 
 
-def _shot(**sensor: float) -> Case:
-    return Case(sensor=Sensor(**sensor))
+def _shot(**sensor: float) -> StressCase:
+    return StressCase(sensor=Sensor(**sensor))
 
 
-def _between(other: Take, share: float, exposure: float = 1.0) -> Case:
-    return Case(mix=((Take(), 1.0 - share), (other, share)), sensor=Sensor(exposure=exposure))
+def _between(other: Take, share: float, exposure: float = 1.0) -> StressCase:
+    return StressCase(mix=((Take(), 1.0 - share), (other, share)), sensor=Sensor(exposure=exposure))
 
 
 DIALS = (
@@ -82,7 +82,7 @@ DIALS = (
     Dial("log_footage", "log-like footage that is stated to be sRGB", "share of the log curve", (0.2, 1.0),
          lambda s: _shot(log_curve=s), r"transfer"),
     Dial("shake", "a camera that shakes in the hand", "px from frame to frame", (2.0, 8.0),
-         lambda s: Case(shake_px=s), r"shak|camera moves|do not fit"),
+         lambda s: StressCase(shake_px=s), r"shak|camera moves|do not fit"),
     Dial("defocus", "focus that misses the face", "px", (1.2, 3.5),
          lambda s: _shot(defocus_px=s), r"blur|focus|sharp"),
     Dial("motion_blur", "a slow shutter", "px at the fastest turn", (3.0, 9.0),
@@ -104,23 +104,23 @@ DIALS = (
     Dial("smile", "an expression that changes mid-clip", "strength", (0.4, 1.0),
          lambda s: _seen(smile=s), r"expression|mouth|do not fit"),
     Dial("wrong_focal", "a focal length given too long", "log of stated over true", (0.1, 0.3, math.log(3.0)),
-         lambda s: Case(focal_gain=math.exp(s)), r"focal"),
+         lambda s: StressCase(focal_gain=math.exp(s)), r"focal"),
     Dial("short_focal", "a focal length given too short", "log of true over stated", (0.3, math.log(3.0)),
-         lambda s: Case(focal_gain=math.exp(-s)), r"focal"),
+         lambda s: StressCase(focal_gain=math.exp(-s)), r"focal"),
     Dial("swapped_lens", "focal length and sensor width swapped", "of 1", (1.0,),
-         lambda s: Case(focal_gain=math.exp(s * 2.0 * math.log(SENSOR_MM / SETTINGS.focal_mm))), r"focal"),
+         lambda s: StressCase(focal_gain=math.exp(s * 2.0 * math.log(SENSOR_MM / SETTINGS.focal_mm))), r"focal"),
     Dial("narrow_turn", "a turn too small", "degrees short of the usual 27", (15.0, 22.0),
          lambda s: _seen(yaw_deg=27.0 - s, pitch_deg=max(12.0 - 0.5 * s, 2.0)), r"changes by only|turn"),
     Dial("wide_turn", "a wide turn", "degrees beyond the usual 27", (18.0,),
          lambda s: _seen(yaw_deg=27.0 + s), r"turn|do not fit"),
     Dial("few_frames", "few frames", "frames left out of 24", (12.0, 18.0, 21.0),
-         lambda s: Case(keep=round(SETTINGS.frames - s)), r"usable frames"),
+         lambda s: StressCase(keep=round(SETTINGS.frames - s)), r"usable frames"),
     Dial("pose_error", "poses of another tracker, held", "degrees", (0.5, 1.0, 3.0),
-         lambda s: Case(pose_error_deg=s), r"poses|do not fit"),
+         lambda s: StressCase(pose_error_deg=s), r"poses|do not fit"),
     Dial("landmark_bias", "landmarks of another tracker that slide", "share of the face's width", (0.02, 0.06),
-         lambda s: Case(landmark_slide=s), r"landmarks|do not fit"),
+         lambda s: StressCase(landmark_slide=s), r"landmarks|do not fit"),
     Dial("dark_skin", "very dark skin", "melanin beyond 0.35", (0.65, 1.45),
-         lambda s: Case(mix=((Take(tone=0.35 + s), 1.0),), sensor=Sensor(exposure=2 ** (-0.7 * s))),
+         lambda s: StressCase(mix=((Take(tone=0.35 + s), 1.0),), sensor=Sensor(exposure=2 ** (-0.7 * s))),
          r"scale|skin's (tone|luminance)"),
     Dial("light_skin", "very light skin", "melanin short of 0.35", (0.25,),
          lambda s: _seen(tone=0.35 - s), r"scale|skin's (tone|luminance)"),

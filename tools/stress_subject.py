@@ -13,7 +13,7 @@ from shared.io.arrays import load_arrays, save_arrays
 from shared.io.images import read_exr, write_png
 from tools import synth_output
 from tools.stress_camera import image_motion, photograph, shaken
-from tools.stress_dials import Case
+from tools.stress_dials import StressCase
 from tools.stress_takes import SETTINGS, camera, render_take
 from tools.synth_head import smooth_random
 from tools.synthesize import FPS, SENSOR_MM
@@ -21,7 +21,7 @@ from tools.synthesize import FPS, SENSOR_MM
 VIDEO = "frames/%04d.png"
 
 
-def make_subject(case: Case, folder: Path, takes: Path) -> Path:
+def make_subject(case: StressCase, folder: Path, takes: Path) -> Path:
     """Writes the case's subject into folder, unless it is there; takes: where rendered takes are kept."""
     if (folder / "subject.yaml").exists():
         return folder
@@ -81,7 +81,7 @@ def _write_truth(folder: Path, parts: list[tuple[Path, float]], kept: np.ndarray
     synth_output.write_environment(folder / "envmap.exr", light)
 
 
-def _given_tracking(case: Case, folder: Path, poses: np.ndarray, points: np.ndarray) -> dict:
+def _given_tracking(case: StressCase, folder: Path, poses: np.ndarray, points: np.ndarray) -> dict:
     """Poses or landmarks of "another tracker" with their errors -> `tracking` of subject.yaml."""
     index = np.arange(len(poses))
     if case.pose_error_deg:

@@ -17,7 +17,7 @@ import numpy as np
 from shared.envmap import latlong_directions
 from shared.io.arrays import save_arrays
 from tools import synth_output
-from tools.synth_camera import Camera, PictureQuality
+from tools.synth_camera import PictureQuality, PinholeCamera
 from tools.synth_head import Head, random_head
 from tools.synth_irradiance import IrradianceQuality
 from tools.synth_makeup import made_up, sweaty
@@ -25,11 +25,12 @@ from tools.synth_render import RenderQuality, Scene, render
 from tools.synth_skin import Complexion, SkinPainter
 from tools.synth_surface import Materials
 from tools.synth_wear import coloured, with_beard, with_fringe, with_glasses
-from tools.synthesize import SENSOR_MM, Settings, head_model, light_of, plan_shots
+from tools.synthesize import SENSOR_MM, SynthesisSettings, head_model, light_of, plan_shots
 
-SETTINGS = Settings(size=224, frames=24, level=1, texture=512, truth_frames=6, lights=("room",), light_height=32,
-                    irradiance=IrradianceQuality(size=128, directions=512, lamp_samples=16),
-                    picture=PictureQuality(sub=2, lobe_samples=1, lamp_samples=2))
+SETTINGS = SynthesisSettings(size=224, frames=24, level=1, texture=512, truth_frames=6, lights=("room",),
+                             light_height=32,
+                             irradiance=IrradianceQuality(size=128, directions=512, lamp_samples=16),
+                             picture=PictureQuality(sub=2, lobe_samples=1, lamp_samples=2))
 """Small, so that a run takes less than a minute on one core; the face is 115 px high."""
 RECIPE = 1
 """Raise it whenever SETTINGS or the code that renders give other pictures: kept takes and rows are then not used."""
@@ -71,16 +72,16 @@ class Take:
         return "_".join([*changed, hashlib.sha256(content.encode()).hexdigest()[:8]])
 
     @property
-    def settings(self) -> Settings:
+    def settings(self) -> SynthesisSettings:
         """Of the synthesiser; sharp highlights need more samples."""
         quality = SETTINGS.picture if not self.wet else replace(SETTINGS.picture, lobe_samples=4, lamp_samples=8)
         return replace(SETTINGS, frames=self.frames, yaw_deg=self.yaw_deg, pitch_deg=self.pitch_deg, tone=self.tone,
                        lights=(self.light,), seed=self.seed, picture=quality)
 
 
-def camera() -> Camera:
+def camera() -> PinholeCamera:
     """The one that looks at every take."""
-    return Camera(SETTINGS.size, SETTINGS.size, SETTINGS.focal_mm / SENSOR_MM * SETTINGS.size)
+    return PinholeCamera(SETTINGS.size, SETTINGS.size, SETTINGS.focal_mm / SENSOR_MM * SETTINGS.size)
 
 
 def render_take(take: Take, folder: Path, processes: int = 1) -> Path:

@@ -105,15 +105,18 @@ def answer_current(request: Request) -> bool:
     return True
 
 
-class _OneLineParser(argparse.ArgumentParser):
+class OneLineParser(argparse.ArgumentParser):
+    """A parser whose complaint is an InputError of one line instead of the usage."""
+
     def error(self, message: str) -> None:
-        raise InputError(message, mend="see --help")
+        """argparse's hook for a bad command line. InputError always."""
+        raise InputError(message, mend=f"see {self.prog} --help")
 
 
 def make_parser(stage: Stage) -> argparse.ArgumentParser:
     """The stage's command line, with its parameters in the help text."""
     lines = [f"  {p.name:24} {p.help} Default {p.default}; {p.expected}." for p in stage.parameters]
-    parser = _OneLineParser(prog=f"python -m stages.{stage.name}", description=stage.help,
+    parser = OneLineParser(prog=f"python -m stages.{stage.name}", description=stage.help,
                             epilog="parameters:\n" + "\n".join(lines), formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--subject", type=Path, required=True, metavar="DIR", help="folder with subject.yaml")
     parser.add_argument("--clip", metavar="NAME", help="which clip, where subject.yaml names several")

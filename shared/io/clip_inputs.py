@@ -16,7 +16,7 @@ from shared.io.frames import FrameSet
 from shared.io.images import read_exr
 from shared.io.meshes import load_mesh, read_obj
 from shared.mesh import Mesh
-from shared.texture_match import MeanTexture
+from shared.texture_match import ClipTexture
 
 
 @dataclass(frozen=True)
@@ -88,9 +88,9 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
     return ClipInputs(mesh, pose, frames.intrinsics, frames.size, frames.moves, frames, place, segment, names, tracks)
 
 
-def read_mean_texture(folder: Path, mesh: Mesh) -> MeanTexture:
+def read_mean_texture(folder: Path, mesh: Mesh) -> ClipTexture:
     """What init_albedo averaged on a mesh, from its folder."""
-    return MeanTexture(mesh, read_exr(folder / "mean_texture.exr"), read_exr(folder / "weight.exr"))
+    return ClipTexture(mesh, read_exr(folder / "mean_texture.exr"), read_exr(folder / "weight.exr"))
 
 
 def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.ndarray]:

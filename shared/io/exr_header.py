@@ -40,7 +40,7 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class Part:
+class ExrPart:
     """One part. data, display: windows as (x0, y0, x1, y1), x1 and y1 outside; values: its other attributes of a plain
     type by name; deep: whether a pixel holds several samples.
     """
@@ -63,7 +63,7 @@ class Part:
                    for c in self.channels)
 
 
-def read_parts(path: Path | str) -> list[Part]:
+def read_parts(path: Path | str) -> list[ExrPart]:
     """The parts of an EXR file, none of its pixels read. InputError where the headers are damaged or cut off."""
     try:
         with open(path, "rb") as file:
@@ -78,7 +78,7 @@ def read_parts(path: Path | str) -> list[Part]:
         raise InputError("truncated EXR, or damaged in its header", where=str(path)) from error
 
 
-def check_decodable(path: Path | str, most_pixels: int = MAX_PIXELS) -> Part:
+def check_decodable(path: Path | str, most_pixels: int = MAX_PIXELS) -> ExrPart:
     """The first part, after all parts are found small enough to be decoded. InputError otherwise."""
     parts, where = read_parts(path), str(path)
     for part in parts:
@@ -97,7 +97,7 @@ def check_decodable(path: Path | str, most_pixels: int = MAX_PIXELS) -> Part:
     return parts[0]
 
 
-def _parts(data: bytes, where: str) -> list[Part]:
+def _parts(data: bytes, where: str) -> list[ExrPart]:
     version, parts, at = struct.unpack_from("<I", data, 4)[0], [], 8
     while True:
         attributes, at = _attributes(data, at)
@@ -131,7 +131,7 @@ def _word(data: bytes, at: int) -> tuple[str, int]:
     return data[at:end].decode("utf-8", errors="replace"), end + 1
 
 
-def _part(attributes: dict[str, tuple[str, bytes]], deep: bool, where: str) -> Part:
+def _part(attributes: dict[str, tuple[str, bytes]], deep: bool, where: str) -> ExrPart:
     values: dict[str, object] = {}
     for name, (kind, raw) in attributes.items():
         if _TYPES.get(name, kind) != kind:
@@ -147,7 +147,7 @@ def _part(attributes: dict[str, tuple[str, bytes]], deep: bool, where: str) -> P
             values[name] = raw[0]
     data, display = (_window(values[name]) for name in ("dataWindow", "displayWindow"))
     deep = deep or str(values.get("type", "")).startswith("deep")
-    return Part(_channels(attributes["channels"][1], where), data, display, values, deep)
+    return ExrPart(_channels(attributes["channels"][1], where), data, display, values, deep)
 
 
 def _window(corners: tuple[int, int, int, int]) -> tuple[int, int, int, int]:

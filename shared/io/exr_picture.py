@@ -17,7 +17,7 @@ import OpenEXR
 
 from shared.color import rec709_from_primaries
 from shared.errors import InputError
-from shared.io.exr_header import Part, check_decodable, read_parts
+from shared.io.exr_header import ExrPart, check_decodable, read_parts
 from shared.io.images import read_exr
 from shared.io.source import check_size
 
@@ -35,7 +35,7 @@ class ExrPicture:
     """planes: red, green and blue, or grey alone, each [H, W] of the data window; matrix: to Rec.709, or None."""
 
     planes: tuple[np.ndarray, ...]
-    part: Part
+    part: ExrPart
     matrix: np.ndarray | None
 
     @classmethod
@@ -147,7 +147,7 @@ def read_rec709(path: Path | str) -> np.ndarray:
     return image if matrix is None or image.ndim == 2 else image @ matrix.T.astype(np.float32)
 
 
-def _check_attributes(part: Part, where: str) -> None:
+def _check_attributes(part: ExrPart, where: str) -> None:
     ratio = part.values.get("pixelAspectRatio", 1.0)
     if not abs(ratio - 1) < 1e-3:
         (width, height), known = part.size, 0.1 < ratio < 10
@@ -162,7 +162,7 @@ def _check_attributes(part: Part, where: str) -> None:
                          mend="oiiotool IN.exr --tocolorspace lin_rec709_scene -o OUT.exr")
 
 
-def _matrix(part: Part, where: str) -> np.ndarray | None:
+def _matrix(part: ExrPart, where: str) -> np.ndarray | None:
     """[3, 3] to Rec.709; None where the primaries are Rec.709's, as they are where nothing is said."""
     given = part.values.get("chromaticities")
     if given is None:
@@ -175,7 +175,7 @@ def _matrix(part: Part, where: str) -> np.ndarray | None:
     return None if np.abs(matrix - np.eye(3)).max() < SAME_PRIMARIES else matrix
 
 
-def _names(part: Part, where: str) -> tuple[str, ...]:
+def _names(part: ExrPart, where: str) -> tuple[str, ...]:
     """The channels of the picture."""
     known = {channel.name: channel for channel in part.channels}
     names = ("R", "G", "B") if all(name in known for name in "RGB") else ()

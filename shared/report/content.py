@@ -27,7 +27,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Cost:
+class StageCost:
     """What a stage took; None where that is not known."""
 
     stage: str
@@ -80,7 +80,7 @@ class ReportContent:
     model: Mapping[str, object] = field(default_factory=dict)
     residuals: Mapping[str, object] = field(default_factory=dict)
     iterations: Sequence[Mapping[str, float]] = ()
-    costs: Sequence[Cost] = ()
+    costs: Sequence[StageCost] = ()
     warnings: Sequence[tuple[str, str]] = ()
     parameters: Sequence[tuple[str, str, object]] = ()
     files: Sequence[tuple[str, str]] = ()

@@ -43,7 +43,7 @@ ALBEDO_PULL = 25.0
 
 
 @dataclass(frozen=True)
-class Settings:
+class AppearanceSettings:
     """light_model: see light_models; resolutions: cubemap edge per stage of the solve; independent: how many of the
     samples count as independent evidence against the priors; noise: absolute and relative standard deviation of a
     sample; visibility: whether parts of the head cover each other; precision: most products of a step of the light, and
@@ -79,7 +79,7 @@ class Settings:
 
 
 @dataclass
-class State:
+class AppearanceState:
     """The light's parameters [M, 3] and the model they belong to, specular intensity, roughness, albedo [P, 3],
     node_albedo [K, 3]. Of several lights all parameters and texels lie one below the other."""
 
@@ -99,7 +99,7 @@ class State:
 class AppearanceSolver(SampleErrors):
     """Fits State to a Capture, by the errors of its samples. Tensors inside are channel first: [3, P, F]."""
 
-    def __init__(self, capture: Capture, settings: Settings):
+    def __init__(self, capture: Capture, settings: AppearanceSettings):
         self.capture, self.settings = capture, settings
         frames, noise = capture.frames_of_lights, settings.noise
         super().__init__(capture.samples, capture.fitted, frames, noise, settings.independent)
@@ -117,14 +117,14 @@ class AppearanceSolver(SampleErrors):
 
     # ------------------------------------------------------------------ set-up
     @classmethod
-    def at(cls, capture: Capture, settings: Settings, state: State) -> AppearanceSolver:
+    def at(cls, capture: Capture, settings: AppearanceSettings, state: AppearanceState) -> AppearanceSolver:
         """At a solved state of the capture, its transfer baked: to look at what the samples say there."""
         solver = cls(capture, settings)
         solver.take_state(replace(state))
         solver.bake()
         return solver
 
-    def _start(self) -> State:
+    def _start(self) -> AppearanceState:
         """Uniform lights of the level that the priors prefer for this radiance."""
         weight = (self.trust * self._skin()).double()
         radiance = ((weight * self.colours).sum((1, 2)) / weight.sum()).numpy()
@@ -139,9 +139,9 @@ class AppearanceSolver(SampleErrors):
         specular = self.settings.specular_prior[0] if self.settings.specular else 0.0
         everywhere = (np.tile(albedo, (count, 1)) for count in (points, nodes))
         model = make_light_model("cubemap", resolution, len(self.light_frames))
-        return State(log_light, model, specular, self.settings.roughness, *everywhere)
+        return AppearanceState(log_light, model, specular, self.settings.roughness, *everywhere)
 
-    def start_from(self, state: State) -> None:
+    def start_from(self, state: AppearanceState) -> None:
         """Light, specular intensity and roughness of a state of other points; the albedo is its typical one."""
         typical, own = np.median(state.albedo, axis=0), self.state
         albedo, node_albedo = (np.tile(typical, (len(some), 1)) for some in (own.albedo, own.node_albedo))
@@ -155,7 +155,7 @@ class AppearanceSolver(SampleErrors):
         model = make_light_model(*stage, len(self.light_frames))
         self.take_state(replace(self.state, params=model.fit(self.state.light), light_model=model))
 
-    def take_state(self, state: State) -> None:
+    def take_state(self, state: AppearanceState) -> None:
         """Goes on from a state of these points as it is."""
         self.state, capture = state, self.capture
         if self.prior_shares:

@@ -53,7 +53,7 @@ LIKELY_LUMINANCE = (0.03, 0.85)
 
 
 @dataclass(frozen=True)
-class ChartView:
+class ChartTransfer:
     """A sight with all that does not depend on the light. cosine [D, N] of N normals with the world's directions and
     their log weights [N]; free [11 * 24, D] float32: whether a direction is open at each depth and patch."""
 
@@ -120,7 +120,7 @@ def _between_depths(values: np.ndarray) -> np.ndarray:
 class ChartStatement:
     """Views of a chart in the frames of a clip; light: which of several it stands in."""
 
-    views: tuple[ChartView, ...]
+    views: tuple[ChartTransfer, ...]
     light: int = 0
 
     def log_factor(self, light: np.ndarray, skin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -172,7 +172,7 @@ def state_chart(
             cosine = np.maximum(directions @ (world_from_camera @ normals.T), 0.0).astype(np.float32)
             points = _patch_places(sight.corners, mean, intrinsics, pose[2, 3])
             free = _open_directions(points, scene, pose, directions @ world_from_camera)
-            views.append(ChartView(sight, cosine, log_weight, free))
+            views.append(ChartTransfer(sight, cosine, log_weight, free))
     if views:
         return ChartStatement(tuple(views), light), ""
     return None, "the colour chart is turned away from the camera: not used" if sights else ""

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from shared.solve.appearance import LARGEST_ROUGHENING, AppearanceSolver, Settings, State
+from shared.solve.appearance import LARGEST_ROUGHENING, AppearanceSettings, AppearanceSolver, AppearanceState
 from shared.solve.capture import Capture
 from shared.solve.light_step import LightStep
 from shared.solve.light_trust import weigh_samples
@@ -45,7 +45,7 @@ class Solution:
     local_specular: where the specular intensity varies with the face's segments, how; light_trust: of several lights,
     how much samples of each count against those of the light that the model follows best."""
 
-    state: State
+    state: AppearanceState
     iterations: tuple[dict, ...]
     fitted: float
     held_out: float
@@ -59,7 +59,7 @@ class Solution:
 
 def fit_appearance(
     capture: Capture,
-    settings: Settings,
+    settings: AppearanceSettings,
     report: Callable[[dict], None] = lambda record: None,
     start: Solution | None = None,
     keep_start: bool = False,
@@ -145,7 +145,7 @@ def with_local_roughness(solver: AppearanceSolver, solution: Solution) -> Soluti
 
 
 def _step(
-    solver: AppearanceSolver, settings: Settings, trusts: bool, moves: bool = True
+    solver: AppearanceSolver, settings: AppearanceSettings, trusts: bool, moves: bool = True
 ) -> tuple[dict, float, np.ndarray]:
     """One step of everything -> its record, by what factor the robust loss rose, and the error of each frame [F];
     trusts: highlights say something about the scale and their own strength; moves: the light changes, and not only its
@@ -193,5 +193,5 @@ def _linearised(solver: AppearanceSolver) -> LightStep:
     return step
 
 
-def _copy(state: State) -> State:
+def _copy(state: AppearanceState) -> AppearanceState:
     return replace(state, params=state.params.copy(), albedo=state.albedo.copy())

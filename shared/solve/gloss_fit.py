@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from shared.solve.appearance import ROUGHNESS_SPREAD, AppearanceSolver, Settings, State
+from shared.solve.appearance import ROUGHNESS_SPREAD, AppearanceSettings, AppearanceSolver, AppearanceState
 
 
 class GlossFit:
@@ -50,7 +50,7 @@ class GlossFit:
         return float(self.best[1]) if len(self.best) > 1 else 0.0
 
 
-def _prior(settings: Settings, state: State) -> tuple[np.ndarray, np.ndarray]:
+def _prior(settings: AppearanceSettings, state: AppearanceState) -> tuple[np.ndarray, np.ndarray]:
     """Mean and precision, each [2], of the specular intensity and of the change of the log roughness."""
     mean, sigma = settings.specular_prior
     back = np.log(settings.roughness / state.roughness)

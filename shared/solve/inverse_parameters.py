@@ -9,7 +9,7 @@ import torch
 from shared.contract.job import Parameters
 from shared.contract.wording import unknown_name
 from shared.errors import InputError
-from shared.solve.appearance import Settings
+from shared.solve.appearance import AppearanceSettings
 from shared.solve.capture import Sizes
 from shared.solve.inverse_problem import InverseSettings
 from shared.solve.ladder import PARTS
@@ -28,7 +28,7 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
     if params.model == "auto" and params.solver == "reference":
         raise InputError("model=auto belongs to solver=transfer", where="--set inverse_render.model",
                          mend="leave out one of the two; the reference solver takes visibility and specular as given")
-    appearance = Settings(
+    appearance = AppearanceSettings(
         light_model=params.light_model,
         resolutions=tuple(n for n in (8, 16, 32) if n <= params.light_resolution) or (params.light_resolution,),
         steps=params.light_steps,

@@ -11,7 +11,7 @@ from shared.gather import Picture, SurfaceViewer
 from shared.mesh import Mesh
 from shared.read_ahead import read_ahead
 from shared.shading import Material, VertexShading
-from shared.solve.appearance import Settings
+from shared.solve.appearance import AppearanceSettings
 from shared.solve.capture import (
     Capture,
     Scenery,
@@ -69,7 +69,7 @@ class InverseSettings:
     to the map, texels share their specular intensity: what held-out frames choose from."""
 
     sizes: Sizes = field(default_factory=Sizes)
-    appearance: Settings = field(default_factory=Settings)
+    appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
     light_frames: int = 48
     map_size: int = 1024
     hold_out_every: int = 8
@@ -151,7 +151,7 @@ def capture_skin(
 
 
 def shade_vertices(
-    inputs, appearance: Settings, viewer, scenery: Scenery, solution: Solution, progress
+    inputs, appearance: AppearanceSettings, viewer, scenery: Scenery, solution: Solution, progress
 ) -> VertexShading:
     """Shading of all vertices that some frame faces, in all frames."""
     index = np.nonzero(face_front(viewer, inputs.camera_from_head, -0.1))[0]

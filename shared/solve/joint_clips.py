@@ -27,7 +27,7 @@ from shared.geometry import (
 )
 from shared.mesh import Mesh, normalised
 from shared.solve.reshape import track_points
-from shared.texture_match import Matches, MeanTexture, match_textures
+from shared.texture_match import ClipTexture, Matches, match_textures
 
 MATCHES, LEAST_MATCHES = 2000, 300
 """Texels that a pose is solved from, and fewer than which show that the clips have no skin in common."""
@@ -85,7 +85,7 @@ class JointInputs:
                 for k, (count, px) in enumerate(facts)]
 
 
-def join_clips(clips: Sequence, textures: Sequence[MeanTexture]) -> JointInputs:
+def join_clips(clips: Sequence, textures: Sequence[ClipTexture]) -> JointInputs:
     """Clips (shared.io.clip_inputs.ClipInputs) in the head space of the one that knows depth best; textures: theirs.
 
     Clips without tracks, whose mesh and poses were given, share a head space already. InputError where the clips show

@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.appearance import AppearanceSettings, AppearanceSolver
 from shared.solve.capture import Capture
 from shared.solve.fit_appearance import Solution, fit_appearance
 
@@ -65,7 +65,7 @@ class Model(NamedTuple):
     specular: str
     light: str
 
-    def applied(self, settings: Settings) -> Settings:
+    def applied(self, settings: AppearanceSettings) -> AppearanceSettings:
         """Settings of this model."""
         light_model, resolution = LIGHTS.get(self.light, (self.light, settings.resolutions[-1]))
         return replace(
@@ -78,7 +78,7 @@ class Model(NamedTuple):
         )
 
 
-def allowed_rungs(settings: Settings, forced: frozenset[str] = frozenset()) -> dict[str, tuple[str, ...]]:
+def allowed_rungs(settings: AppearanceSettings, forced: frozenset[str] = frozenset()) -> dict[str, tuple[str, ...]]:
     """The rungs of each part up to what the settings say; of forced parts only that."""
     finest = max(settings.resolutions)
     lights = tuple(name for name, (model, resolution) in LIGHTS.items() if model != "cubemap" or resolution <= finest)
@@ -124,7 +124,7 @@ class Ladder:
     def __init__(
         self,
         captures: Mapping[bool, Capture],
-        settings: Settings,
+        settings: AppearanceSettings,
         rungs: Mapping[str, tuple[str, ...]],
         report: Callable[[dict], None] = lambda record: None,
     ):

@@ -15,7 +15,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from shared.mesh import Mesh
-from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.appearance import AppearanceSettings, AppearanceSolver
 from shared.solve.capture import Capture
 from shared.solve.fit_appearance import Solution
 from shared.solve.ladder import LOOK_AHEAD, Trial, describe, serves
@@ -80,7 +80,7 @@ class GlossLadder:
     def __init__(
         self,
         capture: Capture,
-        settings: Settings,
+        settings: AppearanceSettings,
         trial: Trial,
         segment: np.ndarray | None,
         rungs: Mapping[str, tuple[str, ...]],

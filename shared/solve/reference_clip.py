@@ -13,7 +13,7 @@ import torch
 from shared.errors import InputError
 from shared.gather import SurfaceViewer
 from shared.io.arrays import load_arrays, save_arrays
-from shared.solve.appearance import State
+from shared.solve.appearance import AppearanceState
 from shared.solve.capture import set_scenery, spread_frames
 from shared.solve.chart_scale import describe_scale
 from shared.solve.fit_appearance import Solution
@@ -188,7 +188,7 @@ def map_material(solver: ReferenceSolver, average: Average) -> TexelMaterial:
     return TexelMaterial(albedo, specular, average.weight / SAMPLE_SPREAD**2)
 
 
-def final_state(solver: ReferenceSolver, material: TexelMaterial, roughness: float, nodes: int) -> State:
+def final_state(solver: ReferenceSolver, material: TexelMaterial, roughness: float, nodes: int) -> AppearanceState:
     """The light, made coarse enough for the transfer's renderer, and typical material."""
     light = solver.light().detach().cpu().double().numpy()
     edge = round((len(light) / 6) ** 0.5)
@@ -198,7 +198,7 @@ def final_state(solver: ReferenceSolver, material: TexelMaterial, roughness: flo
     specular = float(np.median(material.specular))
     typical = np.median(material.albedo[material.information > 1.0], axis=0)
     params = np.log(np.maximum(light, 1e-6))
-    return State(params, LogLight(edge), specular, roughness, material.albedo, np.tile(typical, (nodes, 1)))
+    return AppearanceState(params, LogLight(edge), specular, roughness, material.albedo, np.tile(typical, (nodes, 1)))
 
 
 @torch.no_grad()

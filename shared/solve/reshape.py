@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from shared.intersections import move_without_crossing
 from shared.mesh import Mesh, subdivide
-from shared.solve.appearance import Settings
+from shared.solve.appearance import AppearanceSettings
 from shared.solve.capture import Sizes, lens_of_frames
 from shared.solve.shape import HELD, SHAPED, Reflectance, ShapeClip, ShapeSettings, ShapeSolver, Traced
 from shared.solve.shape_step import TrackPoints
@@ -93,7 +93,7 @@ def reshape(
     inputs,
     frames: tuple[np.ndarray, np.ndarray],
     reflectance: Reflectance,
-    appearance: Settings,
+    appearance: AppearanceSettings,
     sizes: Sizes,
     settings: ShapeSettings,
     progress: Callable,

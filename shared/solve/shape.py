@@ -17,7 +17,7 @@ from shared.gather import SurfaceViewer
 from shared.mesh import Mesh, subdivide, vertex_normals
 from shared.read_ahead import read_ahead
 from shared.shading import DEEP, Material, VertexShading
-from shared.solve.appearance import Settings
+from shared.solve.appearance import AppearanceSettings
 from shared.solve.capture import Scenery, Sizes, face_front, set_scenery
 from shared.solve.fit_appearance import Solution
 from shared.solve.local_roughness import GlossEquations
@@ -103,7 +103,7 @@ next more than makes up for it. The best of all stays."""
 
 
 @dataclass(frozen=True)
-class Surface:
+class ShapedSurface:
     """A mesh, the vertices index [P] that are shaped, and their equations."""
 
     mesh: Mesh
@@ -141,7 +141,7 @@ class ShapeSolver:
         self,
         clip: ShapeClip,
         reflectance: Reflectance,
-        appearance: Settings,
+        appearance: AppearanceSettings,
         sizes: Sizes,
         settings: ShapeSettings,
         progress: Callable = lambda items, label: items,
@@ -174,7 +174,7 @@ class ShapeSolver:
         shading = self._shade(mesh, traced, points, traced.turned_to(points.normals))
         return replace(traced, reflections=Reflections(shading, np.arange(len(index))))
 
-    def examine(self, mesh: Mesh, shaped: np.ndarray, traced: Traced) -> Surface | None:
+    def examine(self, mesh: Mesh, shaped: np.ndarray, traced: Traced) -> ShapedSurface | None:
         """Samples, shading and equations of the traced vertices; None where hardly any is seen."""
         clip, settings, index = self.clip, self.settings, traced.index
         points = mesh_points(mesh, index)
@@ -199,7 +199,7 @@ class ShapeSolver:
             clip.fitted,
             settings.equations,
         )
-        return Surface(mesh, index[rows], terms.tangents, equations)
+        return ShapedSurface(mesh, index[rows], terms.tangents, equations)
 
     def _shade(self, mesh, traced: Traced, points, transfer) -> VertexShading:
         known, scenery = self.reflectance, traced.scenery
@@ -220,7 +220,7 @@ class ShapeSolver:
             light_index=self.clip.light_index,
         )
 
-    def step(self, surface: Surface, start: np.ndarray, shaped: np.ndarray, held: np.ndarray) -> np.ndarray:
+    def step(self, surface: ShapedSurface, start: np.ndarray, shaped: np.ndarray, held: np.ndarray) -> np.ndarray:
         """Offsets [V] along the normals."""
         mesh, count = surface.mesh, len(surface.mesh.vertices)
         normals = vertex_normals(mesh.vertices, mesh.faces)
@@ -287,5 +287,5 @@ def typical_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)))
 
 
-def _residuals(surface: Surface) -> str:
+def _residuals(surface: ShapedSurface) -> str:
     return f"residual {surface.equations.fitted:.5f} fitted, {surface.equations.held_out:.5f} held out"

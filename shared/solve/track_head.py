@@ -32,7 +32,7 @@ from shared.solve.first_poses import (
 from shared.solve.fit_head import FitWeights, HeadFit, fit_codes, landmarks_on_points
 from shared.solve.fit_surface import fit_surface
 from shared.solve.pose_trust import focal_elsewhere, trust
-from shared.solve.texture_tracking import TexturePass, coarse_pass, solve_texture, track_texture
+from shared.solve.texture_tracking import TrackingPass, coarse_pass, solve_texture, track_texture
 from shared.solve.tracked_clip import TrackedClip
 from shared.texture_tracks import Windows
 
@@ -112,7 +112,7 @@ def track_head(
     found = _texture_pass(clip, model, fit, poses, known, coarse_pass(clip.face_width_px), progress)
     note(_summary("tracks", found))
     refuse_still_head(found.solution.camera_from_points[found.reliable])
-    fine = TexturePass(
+    fine = TrackingPass(
         settings.texel_px, True, settings.tracks, Windows(sigma=settings.window_sigma), settings.prior_mm
     )
     for _ in range(settings.fine_passes):

@@ -38,7 +38,7 @@ HELD_OUT_SHOWN = 4
 
 
 @dataclass(frozen=True)
-class Camera:
+class ViewCamera:
     """camera_from_head [4, 4] mm, intrinsics [3, 3] px of a picture of size (width, height)."""
 
     camera_from_head: np.ndarray
@@ -53,7 +53,7 @@ def make_views(
     camera_from_head: np.ndarray,
     moves: str,
     pixels: int,
-    held_out: Mapping[int, Camera],
+    held_out: Mapping[int, ViewCamera],
     progress: Callable | None = None,
 ) -> ViewSet:
     """All of them, pixels wide. maps and progress as for HeadViews; envmap [H, 2 H, 3], camera_from_head [F, 4, 4] and
@@ -71,7 +71,7 @@ def make_views(
     )
 
 
-def orbit_camera(mesh: Mesh, yaw_deg: float, pitch_deg: float, pixels: int) -> Camera:
+def orbit_camera(mesh: Mesh, yaw_deg: float, pitch_deg: float, pixels: int) -> ViewCamera:
     """A camera that looks at the head's middle from yaw (90: its left, the picture's right seen from the front) and
     pitch (90: above), a square picture of the given size."""
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
@@ -82,12 +82,12 @@ def orbit_camera(mesh: Mesh, yaw_deg: float, pitch_deg: float, pixels: int) -> C
     rotation = np.stack([right, np.cross(right, back), -back])  # x right, y down, z forward
     focal = FILLED * pixels / 2 * DISTANCE_MM / radius
     intrinsics = np.array([[focal, 0.0, pixels / 2], [0.0, focal, pixels / 2], [0.0, 0.0, 1.0]])
-    return Camera(rigid(rotation, -rotation @ (middle + DISTANCE_MM * back)), intrinsics, (pixels, pixels))
+    return ViewCamera(rigid(rotation, -rotation @ (middle + DISTANCE_MM * back)), intrinsics, (pixels, pixels))
 
 
 def held_out_cameras(
     poses: Mapping[str, np.ndarray], intrinsics: np.ndarray, size: tuple[int, int], solve: Mapping
-) -> dict[int, Camera]:
+) -> dict[int, ViewCamera]:
     """{frame: Camera} of a few held-out frames that inverse_render did not re-render.
 
     poses: its poses.npz; intrinsics [3, 3] and size of the crop, where that does not hold the former; solve: its
@@ -98,7 +98,7 @@ def held_out_cameras(
     rest = [frame for frame in solve.get("held_out_frames", ()) if frame in place and frame not in done]
     chosen = [rest[i] for i in spread_frames(len(rest), HELD_OUT_SHOWN)] if rest else []
     lens = poses.get("intrinsics_crop", intrinsics)
-    return {frame: Camera(poses["camera_from_head"][place[frame]], lens, size) for frame in chosen}
+    return {frame: ViewCamera(poses["camera_from_head"][place[frame]], lens, size) for frame in chosen}
 
 
 def frontal_frame(camera_from_head: np.ndarray) -> int:
@@ -126,7 +126,7 @@ class HeadViews:
         mesh: Mesh,
         maps: Mapping[str, np.ndarray],
         sizes: Sizes | None = None,
-        cameras: Sequence[Camera] = (),
+        cameras: Sequence[ViewCamera] = (),
         progress: Callable | None = None,
         light_resolution: int = LIGHT_RESOLUTION,
         deep: float = DEEP,
@@ -147,7 +147,7 @@ class HeadViews:
         self._surface_place = np.concatenate([mesh.vertices, ORIENTATION_MM * self.viewer.normals], axis=1)
         self._lit: VertexShading | None = None
 
-    def _seen(self, cameras: Sequence[Camera]) -> np.ndarray:
+    def _seen(self, cameras: Sequence[ViewCamera]) -> np.ndarray:
         """[V] bool: vertices that some camera sees, and those around them, whose triangles reach into the open."""
         seen = np.zeros(len(self.viewer.mesh.vertices), bool)
         for camera in cameras:
@@ -158,7 +158,7 @@ class HeadViews:
         return self.viewer.grown(seen)
 
     @staticmethod
-    def _towards(camera: Camera, positions: np.ndarray) -> np.ndarray:
+    def _towards(camera: ViewCamera, positions: np.ndarray) -> np.ndarray:
         """[N, 3] unit vectors from the positions to the camera."""
         return normalised(camera_centres(camera.camera_from_head[None])[0] - positions)
 
@@ -174,7 +174,7 @@ class HeadViews:
         return Material(albedo, gloss, float(np.median(roughness)), roughness[self.index] if varies else None)
 
     def render(
-        self, light: np.ndarray, cameras: Sequence[Camera], moves: str = "camera", fade: bool = True
+        self, light: np.ndarray, cameras: Sequence[ViewCamera], moves: str = "camera", fade: bool = True
     ) -> list[np.ndarray]:
         """Lat-long radiance [H, 2 H, 3] -> a linear picture [h, w, 3] per camera, 0 beside the head.
 
@@ -211,7 +211,7 @@ class HeadViews:
             return self._lit
         return self._lit.under(light, poses, moves)
 
-    def coverage(self, camera: Camera, samples: int = 2) -> np.ndarray:
+    def coverage(self, camera: ViewCamera, samples: int = 2) -> np.ndarray:
         """[h, w] in 0 .. 1: how much of each pixel the head covers, as render counts it."""
         covered = np.zeros(camera.size[::-1])
         for row in range(samples):
@@ -221,7 +221,7 @@ class HeadViews:
                 covered += camera_hits(self.viewer.scene, pose, lens, *camera.size, offsets)[0] >= 0
         return covered / samples**2
 
-    def visibility(self, camera: Camera, roughness: float) -> np.ndarray:
+    def visibility(self, camera: ViewCamera, roughness: float) -> np.ndarray:
         """[h, w]: share of a lobe of this roughness about the reflected direction that the head leaves open; NaN beside
         the head. 1 where nothing covers it; for rough lobes it nears the sky's open share."""
         normals = self.points.normals
