@@ -78,9 +78,9 @@ class ChartWatch:
         return [(index, view, fit) for index, view, fit in self._views if not _fault(view, fit)]
 
     def record(self) -> list[dict]:
-        """The frames in which the chart can be used, as ChartSight.from_record reads them: frame_index; corners [4, 2]
-        source px; patches [24, 3] linear values, clipped [24, 3] (1 where one only says "at least"); white, log_sigma,
-        glare [3], trust [24] and misfit (neutral, coloured) of ChartFit; pitch_px."""
+        """The frames in which the chart can be used, as ChartObservation.from_record reads them: frame_index; corners
+        [4, 2] source px; patches [24, 3] linear values, clipped [24, 3] (1 where one only says "at least"); white,
+        log_sigma, glare [3], trust [24] and misfit (neutral, coloured) of ChartFit; pitch_px."""
         return [{
             "frame_index": int(index),
             "corners": np.round(view.corners, 2).tolist(),

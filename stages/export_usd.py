@@ -211,7 +211,7 @@ def write_lights(job: Job, writer, envmap, clips: list) -> None:
 def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     """The content of run.json: what each stage was told, what it took, what it found."""
     from shared.mesh_checks import mesh_warnings
-    from shared.report.gather import ladder_record, own_record, stage_record, warnings_of
+    from shared.report.gather import own_record, selection_record, stage_record, warnings_of
 
     records, warnings = {}, []
     for name in job.input_names:
@@ -226,8 +226,8 @@ def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     records[STAGE.name] = own
     kept = ("model", "residuals", "albedo_scale", "held_out_frames", "clips")
     chosen = {key: solve[key] for key in kept if key in solve}
-    if ladder := ladder_record(job.input("inverse_render"), solve):
-        chosen["ladder"] = ladder
+    if selection := selection_record(job.input("inverse_render"), solve):
+        chosen["ladder"] = selection
     return {
         "subject": job.subject.name,
         "stages": records,

@@ -30,7 +30,7 @@ from shared.errors import InputError, LimnError
 
 SOLVERS = ("transfer", "reference")
 MODELS = ("full", "auto")
-LADDER_SECONDS = "ladder_seconds.json"
+SELECTION_SECONDS = "ladder_seconds.json"
 LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 STAGE = Stage(
@@ -54,7 +54,7 @@ STAGE = Stage(
         Output("clips/*/renders/*.exr", "re-renders of another clip", space="crop", colour_space="lin_rec709_scene",
                optional=True),
         Output("solve.json", "model, residuals, steps, scale of the albedo, held-out frames, warnings", fields=SOLVE),
-        Output(LADDER_SECONDS, "what each rung of solve.json's ladder took (model=auto)", unit="s",
+        Output(SELECTION_SECONDS, "what each candidate of solve.json's model selection took (model=auto)", unit="s",
                volatile=True, optional=True, fields=LADDER_TIMES),
     ),
     parameters=(
@@ -203,11 +203,11 @@ def write_shape(job: Job, inputs, mesh) -> None:
     from shared.io.meshes import save_mesh
     from shared.shape_pictures import shape_sheet
     from shared.solve.inverse_problem import FACE_SKIN
-    from shared.solve.reshape import Reshaped, faces_of, segments_of, subdivided_to
+    from shared.solve.reshape import RefinedInputs, faces_of, segments_of, subdivided_to
 
     segment = segments_of(inputs, mesh)
     save_mesh(job.out / "mesh.npz", mesh, **({} if segment is None else {"face_segment": segment}))
-    face = None if segment is None else faces_of(Reshaped(inputs, mesh), FACE_SKIN)
+    face = None if segment is None else faces_of(RefinedInputs(inputs, mesh), FACE_SKIN)
     write_png(job.out / "shape.png", shape_sheet(subdivided_to(inputs.mesh, mesh), mesh, face))
 
 
@@ -231,9 +231,9 @@ def run(job: Job) -> None:
         inputs = join_clips(clips, textures)
         placed = [{"name": name, **facts} for name, facts in zip(job.clips, inputs.describe(), strict=True)]
         job.note(f"clips in one head space: {placed}")
-    sights = inputs.chart_sights() if job.params.chart else ()
+    observations = inputs.chart_observations() if job.params.chart else ()
     settings = read_settings(job.params, job.out.parent / CHECKPOINT)
-    result = solve_clip(inputs, settings, job.progress, job.note, sights)
+    result = solve_clip(inputs, settings, job.progress, job.note, observations)
     record = summarise(inputs, result)
     record["warnings"] += [f"clip {clip['name']} lies {clip['match_px']:.1f} px beside the shared mesh: other lens, "
                            "another expression?" for clip in placed if clip.get("match_px", 0.0) > FAR_PX]
@@ -248,8 +248,8 @@ def run(job: Job) -> None:
     record |= own[0]
     if job.clips:
         record["clips"] = [clip | frames for clip, frames in zip(placed, own, strict=True)]
-    if rungs := record.get("ladder"):
-        write_json(job.out / LADDER_SECONDS, [rung.pop("seconds") for rung in rungs])
+    if candidates := record.get("ladder"):
+        write_json(job.out / SELECTION_SECONDS, [candidate.pop("seconds") for candidate in candidates])
     write_json(job.out / "solve.json", record)
 
 

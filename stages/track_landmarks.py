@@ -185,10 +185,10 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
     from shared.mesh import Mesh
     from shared.overlay import overlay_strip
     from shared.solve.first_poses import choose_references
-    from shared.solve.judge_track import judge_frames
+    from shared.solve.judge_track import frames_that_fit
     from shared.tracking_pictures import pose_curves, residual_map
 
-    fits, reasons = judge_frames(track, job.params.outlier_factor)
+    fits, reasons = frames_that_fit(track, job.params.outlier_factor)
     kept, poses, covariance = used[fits], track.camera_from_head[fits], track.covariance[fits]
     gain = track.focal_gain if track.focal_solved else 1.0
     lens = zoomed(frames.intrinsics, gain)

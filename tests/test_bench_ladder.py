@@ -1,4 +1,4 @@
-"""The benchmark of the ladder: what it compares, and that an interrupted table goes on."""
+"""The benchmark of model selection: what it compares, and that an interrupted table goes on."""
 
 import pytest
 
@@ -6,8 +6,9 @@ from tools import bench_ladder
 from tools.bench_ladder import compare, main, read_rows, write_rows
 
 
-def row(clip, rung, mesh, error, seconds):
-    return {"clip": clip, "rung": rung, "mesh": mesh, "held_out": 1.2 * error, "held_out_abs": error, "cpu_s": seconds,
+def row(clip, candidate, mesh, error, seconds):
+    return {"clip": clip, "rung": candidate, "mesh": mesh, "held_out": 1.2 * error, "held_out_abs": error,
+            "cpu_s": seconds,
             "light": "cubemap 8", "visibility": "bounces", "specular": True, "chosen": ""}
 
 
@@ -29,9 +30,9 @@ def test_rows_survive_the_table_and_are_not_measured_again(tmp_path, monkeypatch
     assert [float(old["held_out_abs"]) for old in read_rows(table)] == [0.0103, 0.02]
     measured = []
 
-    def measure(inputs, clip, rung, given):
-        measured.append((clip, rung, given))
-        return [row(clip, rung, mesh, 0.01, 60.0) for mesh in ("tracked", "refined")]
+    def measure(inputs, clip, candidate, given):
+        measured.append((clip, candidate, given))
+        return [row(clip, candidate, mesh, 0.01, 60.0) for mesh in ("tracked", "refined")]
 
     monkeypatch.setattr(bench_ladder, "measure", measure)
     monkeypatch.setattr(bench_ladder, "compile_loops", lambda: None)

@@ -49,7 +49,7 @@ def toy_clip(frames, widest, error_px, seed, second=False):
     return SimpleNamespace(
         mesh=mesh, camera_from_head=poses, intrinsics=LENS, size=(256, 256), moves="head", face_segment=None,
         segment_names=(), frames=SimpleNamespace(source_name="clip.avi"), tracks=(points, np.full(400, error_px)),
-        picture=lambda f: (seed, f), chart_sights=lambda: ())
+        picture=lambda f: (seed, f), chart_observations=lambda: ())
 
 
 def test_poses_come_into_the_head_space_of_the_clip_that_knows_depth_best(monkeypatch):
@@ -117,15 +117,15 @@ def test_given_meshes_share_a_head_space_already():
 
 
 def test_the_chart_of_the_first_clip_that_shows_one_counts():
-    from shared.chart import ChartSight
+    from shared.chart import ChartObservation
 
     clips = [toy_clip(4, 0.3, 0.1, seed) for seed in range(3)]
-    sight = ChartSight(*(np.zeros(1) for _ in range(5)), frame=2, frame_index=7)
+    observation = ChartObservation(*(np.zeros(1) for _ in range(5)), frame=2, frame_index=7)
     for clip in clips[1:]:
-        clip.chart_sights = lambda: (sight,)
+        clip.chart_observations = lambda: (observation,)
     for clip in clips:
         clip.tracks = None
-    (found,) = join_clips(clips, ()).chart_sights()
+    (found,) = join_clips(clips, ()).chart_observations()
     assert (found.frame, found.frame_index) == (6, 7)
 
 

@@ -197,9 +197,9 @@ def test_a_roughness_at_the_end_of_its_range_does_not_keep_the_scale_waiting(tru
     capture, albedo, _ = truth
     settings = AppearanceSettings(resolutions=(8,), steps=12, noise=(0.003, 0.01), roughness=0.55)
     solver = AppearanceSolver(capture, replace(settings, roughness=0.5))
-    assert solver.roughen(-1.0) == pytest.approx(np.log(0.5 / 0.48))
-    assert solver.roughen(-1.0) == 0.0 and solver.state.roughness == 0.48
-    assert solver.roughen(0.05) == pytest.approx(0.05)
+    assert solver.update_roughness(-1.0) == pytest.approx(np.log(0.5 / 0.48))
+    assert solver.update_roughness(-1.0) == 0.0 and solver.state.roughness == 0.48
+    assert solver.update_roughness(0.05) == pytest.approx(0.05)
 
     found = fit_appearance(capture, settings)
     assert found.state.roughness == pytest.approx(0.48)

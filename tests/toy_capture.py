@@ -9,7 +9,7 @@ from shared.brdf import hemispherical_albedo
 from shared.envmap import cube_directions
 from shared.gather import Samples
 from shared.geometry import camera_centres, fibonacci_sphere, rigid, rotation_from_vector, world_from_head
-from shared.lobes import LobeTable, specular_reflection
+from shared.lobes import SpecularTransfer, specular_reflection
 from shared.mesh import normalised
 from shared.raycast import RayScene
 from shared.shading import light_along
@@ -92,7 +92,7 @@ def make_truth(
     flat = along.reshape(len(DIRECTIONS), -1), radiosity.reshape(len(direct), -1)
     light = irradiance(transfer, *flat).reshape(len(points), frames, 3)
     towards = normalised(camera_centres(poses)[None] - points.positions[:, None])
-    table = LobeTable(points.normals, transfer.visibility(), DIRECTIONS)
+    table = SpecularTransfer(points.normals, transfer.visibility(), DIRECTIONS)
     roughness = roughness_at(points.positions)
     lobes = [specular_reflection(table, towards[:, f], roughness, along[:, f]) for f in range(frames)]
     albedo = true_albedo(points.positions)
@@ -100,8 +100,8 @@ def make_truth(
     colours += noise * np.random.default_rng(0).normal(size=colours.shape)
     cosine = (towards * points.normals[:, None]).sum(2)
     weight = np.where(cosine > 0.2, cosine**2, 0.0).astype(np.float32)
-    limits = (colours > clip_at).astype(np.int8)
-    samples = Samples(np.clip(colours, 0, clip_at).astype(np.float32), weight, limits, towards.astype(np.float32))
+    saturation = (colours > clip_at).astype(np.int8)
+    samples = Samples(np.clip(colours, 0, clip_at).astype(np.float32), weight, saturation, towards.astype(np.float32))
     fitted, skin = np.tile(np.arange(FRAMES) % 5 != 2, len(lights)), np.ones(len(points), bool)
     capture = Capture(
         points, samples, transfer, nodes, node_transfer, DIRECTIONS, turns, fitted, skin, light_index=light_index

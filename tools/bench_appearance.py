@@ -90,8 +90,8 @@ def measure(
     inputs = join_clips(clips, textures) if len(clips) > 1 else clips[0]
     if len(clips) > 1:
         note(f"clips in one head space: {inputs.describe()}")
-    sights = inputs.chart_sights() if params.chart else ()
-    result = solve_clip(inputs, read_settings(params), silent, note, sights)
+    observations = inputs.chart_observations() if params.chart else ()
+    result = solve_clip(inputs, read_settings(params), silent, note, observations)
     scores = {"seconds": time.perf_counter() - start}
     scores["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     placed = [replace(clip, camera_from_head=inputs.camera_from_head[inputs.light_index == k])

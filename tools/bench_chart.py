@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from shared.chart import ChartSight
+from shared.chart import ChartObservation
 from shared.chart_watch import ChartWatch
 from shared.contract.chart_place import AUTO
 from shared.envmap import cube_from_latlong
@@ -69,8 +69,8 @@ def measure(light: str, places: int, seed: int) -> np.ndarray:
         watch = ChartWatch(AUTO, "srgb")
         watch.expect(1)
         watch.look(0, 0, sensor_codes(EXPOSURE * picture, settings.noise, k))
-        sights = [ChartSight.from_record(record, (0.0, 0.0, 1.0), np.zeros(1)) for record in watch.record()]
-        statement, _ = state_chart(sights, surface.scene, shot.camera_from_head[None], camera.intrinsics, "head")
+        observations = [ChartObservation.from_record(record, (0.0, 0.0, 1.0), np.zeros(1)) for record in watch.record()]
+        statement, _ = state_chart(observations, surface.scene, shot.camera_from_head[None], camera.intrinsics, "head")
         if statement is not None:
             factor, covariance = statement.log_factor(truth, EXPOSURE * SKIN_IRRADIANCE * SKIN)
             said.append(np.stack([factor, np.sqrt(np.diag(covariance))]))

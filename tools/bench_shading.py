@@ -28,11 +28,11 @@ from shared.envmap import cube_from_latlong, latlong_from_cube
 from shared.gather import SurfaceViewer
 from shared.io.images import write_exr
 from shared.io.models import load_head_model
-from shared.lobes import LobeTable, specular_reflection
+from shared.lobes import SpecularTransfer, specular_reflection
 from shared.mesh import Mesh, normalised, subdivide
 from shared.render import SurfaceMaps, render_frame
 from shared.shading import light_along
-from shared.solve.capture import Scenery, Sizes, face_front, set_scenery
+from shared.solve.capture import PrecomputedTransfer, Sizes, face_front, precompute_transfer
 from shared.solve.reference_raster import Raster
 from shared.solve.reference_shade import Sampling, Shader, TorchMaterial
 from shared.solve.views import ViewCamera, orbit_camera
@@ -74,7 +74,7 @@ class TracedView:
 
     viewer: SurfaceViewer
     camera: ViewCamera
-    scenery: Scenery
+    precomputed: PrecomputedTransfer
     index: np.ndarray
     transfer: Transfer
     along: np.ndarray
@@ -87,16 +87,16 @@ class TracedView:
             SurfaceViewer.of(mesh),
             orbit_camera(mesh, YAW_DEG, PITCH_DEG, pixels),
         )
-        scenery = set_scenery(viewer, sizes)
+        precomputed = precompute_transfer(viewer, sizes)
         index = np.nonzero(face_front(viewer, camera.camera_from_head[None], -0.2))[0]
         cube = np.maximum(cube_from_latlong(light, LIGHT_RESOLUTION), 0.0)
-        along = light_along(cube, scenery.directions, np.eye(3)[None])[:, 0]
-        transfer = scenery.trace(mesh_points(mesh, index))
-        return cls(viewer, camera, scenery, index, transfer, along, latlong_from_cube(cube, LATLONG_ROWS, 1))
+        along = light_along(cube, precomputed.directions, np.eye(3)[None])[:, 0]
+        transfer = precomputed.trace(mesh_points(mesh, index))
+        return cls(viewer, camera, precomputed, index, transfer, along, latlong_from_cube(cube, LATLONG_ROWS, 1))
 
     def diffuse(self, albedo: Sequence[float], bounces: int) -> np.ndarray:
         """Picture [h, w, 3] of a matte surface: no bounce, one, or all of them (bounces 0, 1, 2)."""
-        nodes, colour = self.scenery.node_transfer, np.array(albedo)
+        nodes, colour = self.precomputed.node_transfer, np.array(albedo)
         direct = nodes.direct.astype(np.float64) @ self.along
         radiosity = [None, colour * direct, None][bounces]
         if bounces == 2:
@@ -107,7 +107,7 @@ class TracedView:
     def specular(self, roughness: float, split: bool) -> np.ndarray:
         """Picture of the lobe alone at intensity 1: by the split sum or by the sum over directions."""
         points = mesh_points(self.viewer.mesh, self.index)
-        table = LobeTable(points.normals, self.transfer.visibility(), self.scenery.directions)
+        table = SpecularTransfer(points.normals, self.transfer.visibility(), self.precomputed.directions)
         table.narrowest = 2.0 if split else 0.0
         camera = self.camera.camera_from_head
         towards = normalised(-camera[:3, 3] @ camera[:3, :3] - points.positions)

@@ -14,8 +14,8 @@ KEPT_FREE = 0.1
 _CGROUP = Path("/sys/fs/cgroup")
 
 
-def booked(needs: Mapping[str, Mapping[str, float]], kind: str, scale: Mapping[str, float], run: Path, attempt: int,
-           limit: int | None = None, overhead: int = 0) -> int:
+def requested(needs: Mapping[str, Mapping[str, float]], kind: str, scale: Mapping[str, float], run: Path, attempt: int,
+              limit: int | None = None, overhead: int = 0) -> int:
     """Megabytes or minutes of one job. run: the folder that holds work/. attempt: 1, 2 ..: as many times the amount.
 
     limit: no more than that, since a job that asks for more than there is would wait for ever. overhead: added once.
@@ -25,10 +25,10 @@ def booked(needs: Mapping[str, Mapping[str, float]], kind: str, scale: Mapping[s
 
 
 def expected(resources: object) -> str:
-    """What a job has booked, as assignments of a shell; its limits follow, see shared/contract/limits.py."""
+    """What a job has requested, as assignments of a shell; its limits follow, see shared/contract/limits.py."""
     names = {"mem_mb": EXPECTED_MB, "runtime": EXPECTED_MINUTES}
-    booked_of = {kind: getattr(resources, kind, None) for kind in names}
-    return " ".join(f"{names[kind]}={value}" for kind, value in booked_of.items() if isinstance(value, int))
+    requested_of = {kind: getattr(resources, kind, None) for kind in names}
+    return " ".join(f"{names[kind]}={value}" for kind, value in requested_of.items() if isinstance(value, int))
 
 
 def memory_to_give() -> int:

@@ -211,10 +211,10 @@ def _step(value: object, where: str) -> Step:
     needs = given.get("needs") or []
     if not isinstance(needs, list):
         raise InputError("not a list of stages", where=f"{where}.needs", got=shown(needs))
-    booked = parse_needs(given.get("resources"), f"{where}.resources")
+    requested = parse_needs(given.get("resources"), f"{where}.resources")
     threads = _THREADS.parse(given.get("threads"), f"{where}.threads")
     parameters = check_keys(given.get("parameters"), Anything(), f"{where}.parameters")
-    return Step(tuple(map(str, needs)), threads, booked, parameters)
+    return Step(tuple(map(str, needs)), threads, requested, parameters)
 
 
 def _in_order(steps: Mapping[str, Step], path: Path) -> dict[str, Step]:

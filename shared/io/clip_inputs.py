@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shared.chart import ChartSight
+from shared.chart import ChartObservation
 from shared.color import decode_transfer
 from shared.errors import InputError
 from shared.gather import Picture, prepare_picture
@@ -61,9 +61,11 @@ class ClipInputs:
         """Frame f's mask [H, W] uint8, 0: background."""
         return self.frames.read_mask(int(self.place[f]))
 
-    def chart_sights(self) -> tuple[ChartSight, ...]:
+    def chart_observations(self) -> tuple[ChartObservation, ...]:
         """The colour chart in the frames where one was found."""
-        return tuple(ChartSight.from_record(record, self.frames.crop, self.frame_index) for record in self.frames.chart)
+        return tuple(
+            ChartObservation.from_record(record, self.frames.crop, self.frame_index) for record in self.frames.chart
+        )
 
 
 def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: str = "") -> ClipInputs:

@@ -44,14 +44,14 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         local_roughness=params.local_roughness,
         specular_prior=(params.specular_prior, SPECULAR_SPREAD),
     )
-    rim = {} if params.silhouette else {"rim": None}
+    contour = {} if params.silhouette else {"contour": None}
     shape = ShapeSettings(
         subdivisions=params.shape_subdivisions,
         rounds=params.shape_rounds,
         frames=params.shape_frames,
         smoothness=params.shape_smoothness,
         sigma_mm=params.shape_spread,
-        **rim,
+        **contour,
     )
     return InverseSettings(
         sizes=Sizes(params.points, params.directions, params.bounce_nodes),
@@ -63,7 +63,7 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         fit_frames=params.fit_frames,
         normal_map=params.normal_map,
         reference=read_reference(params, checkpoint) if params.solver == "reference" else None,
-        ladder=read_forced(params.forced) if params.model == "auto" else None,
+        selection=read_forced(params.forced) if params.model == "auto" else None,
     )
 
 

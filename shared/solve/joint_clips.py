@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shared.chart import ChartSight
+from shared.chart import ChartObservation
 from shared.errors import InputError
 from shared.gather import Picture
 from shared.geometry import (
@@ -71,11 +71,12 @@ class JointInputs:
     def _first(self, clip: int) -> int:
         return int(np.searchsorted(self.light_index, clip))
 
-    def chart_sights(self) -> tuple[ChartSight, ...]:
+    def chart_observations(self) -> tuple[ChartObservation, ...]:
         """The colour chart of the first clip that shows one: one clip's scale is that of all."""
         for k, clip in enumerate(self.clips):
-            if sights := clip.chart_sights():
-                return tuple(replace(sight, frame=sight.frame + self._first(k)) for sight in sights)
+            if observations := clip.chart_observations():
+                return tuple(replace(observation,
+                                     frame=observation.frame + self._first(k)) for observation in observations)
         return ()
 
     def describe(self) -> list[dict]:

@@ -14,7 +14,7 @@ from shared.errors import InputError
 from shared.gather import SurfaceViewer
 from shared.io.arrays import load_arrays, save_arrays
 from shared.solve.appearance import AppearanceState
-from shared.solve.capture import set_scenery, spread_frames
+from shared.solve.capture import precompute_transfer, spread_frames
 from shared.solve.chart_scale import describe_scale
 from shared.solve.fit_appearance import Solution
 from shared.solve.inverse_problem import FACE_SKIN, InverseResult, InverseSettings, segment_vertices, shade_vertices
@@ -166,12 +166,12 @@ def conclude(inputs, settings, solver: ReferenceSolver, average: Average, fitted
     maps = make_maps(surface, material, roughness)
     maps["roughness"] = roughness_map.astype(np.float32)
     appearance = replace(settings.appearance, bounce=False, visibility=solver.settings.sampling.visibility)
-    scenery = set_scenery(viewer, settings.sizes, appearance.visibility)
-    state = final_state(solver, material, roughness, len(scenery.nodes.points))
+    precomputed = precompute_transfer(viewer, settings.sizes, appearance.visibility)
+    state = final_state(solver, material, roughness, len(precomputed.nodes.points))
     fit = residual(inputs, solver, np.nonzero(fitted)[0])
     held = fit if fitted.all() else residual(inputs, solver, np.nonzero(~fitted)[0])
     solution = Solution(state, tuple(_thinned(records)), fit, held)
-    shading = shade_vertices(inputs, appearance, viewer, scenery, solution, progress)
+    shading = shade_vertices(inputs, appearance, viewer, precomputed, solution, progress)
     record = {
         "texture": {"held_out": {"per texel": held}, "chosen": "per texel"},
         "albedo_scale": describe_scale(None, np.median(state.albedo, axis=0)) | {"method": SCALE},

@@ -1,6 +1,6 @@
 """A solved head from where no camera stood, and under light that no clip had; what it covers of itself.
 
-The scenery is traced once; a view needs a camera, a relit picture a light. Everything happens in head space: the light
+The transfer is traced once; a view needs a camera, a relit picture a light. Everything happens in head space: the light
 is turned into it, and the head stays where it is ("moves: camera" to the shading).
 """
 
@@ -19,7 +19,7 @@ from shared.mesh import Mesh, interpolate, normalised
 from shared.raycast import camera_hits
 from shared.render import SurfaceMaps, render_frame
 from shared.shading import DEEP, Material, VertexShading
-from shared.solve.capture import Sizes, set_scenery, spread_frames
+from shared.solve.capture import Sizes, precompute_transfer, spread_frames
 from shared.split_sum import SplitSum
 from shared.studio_lights import STUDIO_LIGHTS, studio_light
 from shared.texture import sample_bilinear
@@ -135,12 +135,12 @@ class HeadViews:
         self.light_resolution, self.deep = light_resolution, deep
         self.viewer = SurfaceViewer.of(mesh)
         self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"])
-        self.scenery = set_scenery(self.viewer, sizes or Sizes())
+        self.precomputed = precompute_transfer(self.viewer, sizes or Sizes())
         seen = np.ones(len(mesh.vertices), bool) if not cameras else self._seen(cameras)
         self.index = np.nonzero(seen if only is None else seen & only)[0]
         self.points = mesh_points(mesh, self.index)
         wrap = progress or (lambda items, label: items)
-        self.transfer: Transfer = self.scenery.trace(self.points, lambda items: wrap(items, "visibility"))
+        self.transfer: Transfer = self.precomputed.trace(self.points, lambda items: wrap(items, "visibility"))
         self.material = self._material(mesh, maps)
         # What stands in for a point deep in a cavity is the nearest one in the open. Seen from inside the mouth that
         # can be the outside of the cheek, unless orientation counts as well.
@@ -166,7 +166,7 @@ class HeadViews:
         """The maps at the nodes, for light that bounces, and the roughness at the traced points."""
         uv = np.zeros((len(mesh.vertices), 2))
         uv[mesh.faces.ravel()] = mesh.uvs[mesh.face_uvs.ravel()]
-        nearest = cKDTree(mesh.vertices).query(self.scenery.nodes.points.positions)[1]
+        nearest = cKDTree(mesh.vertices).query(self.precomputed.nodes.points.positions)[1]
         albedo = sample_bilinear(maps["diffuse_albedo"], uv[nearest])
         gloss = float(np.median(sample_bilinear(maps["specular_intensity"], uv)))
         roughness = sample_bilinear(maps["roughness"], uv).ravel()
@@ -199,10 +199,10 @@ class HeadViews:
                 self._surface_place,
                 self.points,
                 self.transfer,
-                self.scenery.node_transfer,
+                self.precomputed.node_transfer,
                 self.material,
                 light,
-                self.scenery.directions,
+                self.precomputed.directions,
                 poses,
                 moves,
                 key_step=0.0,
@@ -229,7 +229,7 @@ class HeadViews:
         facing = np.nonzero(((towards * normals).sum(1) > 0.0) & self._seen([camera])[self.index])[0]
         share = np.ones(len(self.viewer.mesh.vertices))
         visible = self.transfer.visibility(facing)
-        share[self.index[facing]] = SplitSum(self.scenery.directions).visible_share(
+        share[self.index[facing]] = SplitSum(self.precomputed.directions).visible_share(
             normals[facing], towards[facing], roughness, visible
         )
         face, bary, _ = camera_hits(self.viewer.scene, camera.camera_from_head, camera.intrinsics, *camera.size)
