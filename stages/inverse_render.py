@@ -65,8 +65,8 @@ STAGE = Stage(
                   "harmonics of its logarithm, one sun and a sky, or a lamp at the camera.", choices=LIGHT_MODELS),
         Parameter("model", str, "full", "Solve the full model that the other parameters describe, or climb towards it "
                   "only as far as held-out frames fit better for it.", choices=MODELS),
-        Parameter("forced", str, "", "Parts of the model that model=auto leaves as the other parameters say, separated "
-                  "by commas: visibility, specular, light, geometry, roughness."),
+        Parameter("fixed_parts", str, "", "Parts of the model that model=auto leaves as the other parameters say, "
+                  "separated by commas: visibility, specular, light, geometry, roughness.", former="forced"),
         Parameter("points", int, 4000, "Surface points that the light is solved from.", "", 200, 40000),
         Parameter("directions", int, 768, "Directions over the sphere.", "", 128, 8192),
         Parameter("bounce_nodes", int, 1000, "Surface nodes that exchange bounced light.", "", 50, 6000),
@@ -81,13 +81,15 @@ STAGE = Stage(
         Parameter("local_roughness", bool, True, "Let roughness vary over the skin where held-out frames gain by it."),
         Parameter("specular_prior", float, 0.7, "Expected specular intensity of skin; index of refraction 1.4: 0.7.",
                   "", 0.01, 2.0),
-        Parameter("white_light", float, 0.15, "Expected deviation of the light's log colour ratios from grey.", "",
-                  0.01, 2.0),
-        Parameter("skin_brightness", float, 0.2, "Expected deviation of the log albedo's brightness at large scale "
-                  "over the skin of a face.", "", 0.01, 10.0),
-        Parameter("skin_colour", float, 0.1, "The same of its colour, per channel about their mean.", "", 0.01, 10.0),
+        Parameter("light_colour_sigma", float, 0.15, "Expected deviation of the light's log colour ratios from grey.",
+                  "", 0.01, 2.0, former="white_light"),
+        Parameter("skin_brightness_sigma", float, 0.2, "Expected deviation of the log albedo's brightness at large "
+                  "scale over the skin of a face.", "", 0.01, 10.0, former="skin_brightness"),
+        Parameter("skin_colour_sigma", float, 0.1, "The same of its colour, per channel about their mean.", "",
+                  0.01, 10.0, former="skin_colour"),
         Parameter("light_smoothness", float, 1.0, "Weight of the light's smoothness.", "", 0.0, 1000.0),
-        Parameter("evidence", float, 5000.0, "How many independent samples the clip counts as.", "", 10.0, 1e7),
+        Parameter("independent_samples", float, 5000.0, "How many independent samples the clip counts as.", "", 10.0,
+                  1e7, former="evidence"),
         Parameter("chart", bool, True, "Take the light's scale from the colour chart that sample_frames found."),
         Parameter("shape", bool, True, "Refine the mesh from shading, parallax and tracks."),
         Parameter("silhouette", bool, True, "Before the solve, move ears, skull and jaw so that the outline meets the "
@@ -97,8 +99,8 @@ STAGE = Stage(
         Parameter("shape_frames", int, 48, "Frames that the shape is solved from, spread evenly.", "frames", 3, 1000),
         Parameter("shape_smoothness", float, 19.0, "Lambda of the large steps: over how many edges, squared, the "
                   "surface moves together.", "", 0.0, 10000.0),
-        Parameter("shape_spread", float, 8.0, "Expected distance of the tracked mesh from the truth where it is wrong "
-                  "as a whole.", "mm", 0.01, 100.0),
+        Parameter("shape_sigma", float, 8.0, "Expected distance of the tracked mesh from the truth where it is wrong "
+                  "as a whole.", "mm", 0.01, 100.0, former="shape_spread"),
         Parameter("normal_map", bool, True, "Solve relief finer than the mesh as a normal map; else it is flat."),
         Parameter("render_count", int, 8, "Frames to re-render, spread evenly.", "frames", 1, 2000),
         Parameter("mesh", str, "", "Mesh (.npz or .obj) to use instead of the tracked one; empty: tracked.",

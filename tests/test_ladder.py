@@ -107,7 +107,7 @@ def test_gloss_that_differs_by_segment_is_found_and_worn(one_thread):
     assert [record["rung"] for record in records] == ["by_segment", "local"]
     solution = Solution(solver_under_true_light(capture).state, (), 0.0, 0.0)
     worn = variation.worn_by(replace(solution, state=replace(solution.state, roughness=1.1 * ROUGHNESS)))
-    found = worn.variation.roughness(capture.points.positions)
+    found = worn.local_roughness_fit.roughness(capture.points.positions)
     assert len(np.unique(found.round(9))) == 2 and worn.local_specular is None
     assert found[forehead == 1].mean() < 0.93 * 1.1 * ROUGHNESS < 1.05 * 1.1 * ROUGHNESS < found[forehead == 0].mean()
 
@@ -117,7 +117,7 @@ def test_one_gloss_everywhere_stays_one(one_thread):
     segment = (capture.points.positions[:, 0] > 0.0).astype(int)
     variation, records = variation_of(capture, segment)
     assert variation == SpecularVariation() and len(records) == 4
-    assert variation.worn_by(Solution(None, (), 0.0, 0.0)).variation is None
+    assert variation.worn_by(Solution(None, (), 0.0, 0.0)).local_roughness_fit is None
 
 
 def test_points_take_the_segment_of_the_surface_next_to_them():
@@ -294,7 +294,7 @@ def told(**changes):
 def test_the_stage_climbs_only_when_told_to():
     assert read_settings(told()).selection is None
     assert read_settings(told(model="auto")).selection == frozenset()
-    assert read_settings(told(model="auto", forced="light, geometry")).selection == {"light", "geometry"}
+    assert read_settings(told(model="auto", fixed_parts="light, geometry")).selection == {"light", "geometry"}
 
 
 def test_forcing_what_there_is_not_is_one_clear_line():

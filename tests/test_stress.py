@@ -175,7 +175,7 @@ def toy(monkeypatch):
         own = row(normals=99.0) if name == "toy_2" else row(warnings=["another toy"] if name == "toy_1" else [])
         write_json(stress.row_file(work, case), {"name": name, "code": version, "seconds": 1.0, **own})
 
-    monkeypatch.setattr(stress, "DIALS", TOY)
+    monkeypatch.setattr(stress, "PERTURBATIONS", TOY)
     monkeypatch.setattr(stress, "do_case", do)
     return ran
 
@@ -220,7 +220,7 @@ def test_table_and_chart_show_every_row(toy, tmp_path):
 
 def test_an_unknown_perturbation_is_refused(tmp_path, capsys):
     assert stress.main([str(tmp_path), "--perturbations", "rain"]) == 2
-    assert "no such dial" in capsys.readouterr().err and not (tmp_path / "rows").exists()
+    assert "no such perturbation" in capsys.readouterr().err and not (tmp_path / "rows").exists()
 
 
 def test_a_row_tells_what_was_run(tmp_path, monkeypatch):

@@ -32,10 +32,10 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         light_model=params.light_model,
         resolutions=tuple(n for n in (8, 16, 32) if n <= params.light_resolution) or (params.light_resolution,),
         steps=params.light_steps,
-        independent=params.evidence,
+        independent=params.independent_samples,
         priors=LightPriors(smooth=params.light_smoothness),
-        white_sigma=params.white_light,
-        skin=SkinVariation(params.skin_brightness, params.skin_colour),
+        white_sigma=params.light_colour_sigma,
+        skin=SkinVariation(params.skin_brightness_sigma, params.skin_colour_sigma),
         visibility=params.visibility,
         bounce=params.bounce,
         specular=params.specular,
@@ -50,7 +50,7 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         rounds=params.shape_rounds,
         frames=params.shape_frames,
         smoothness=params.shape_smoothness,
-        sigma_mm=params.shape_spread,
+        sigma_mm=params.shape_sigma,
         **contour,
     )
     return InverseSettings(
@@ -63,7 +63,7 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         fit_frames=params.fit_frames,
         normal_map=params.normal_map,
         reference=read_reference(params, checkpoint) if params.solver == "reference" else None,
-        selection=read_forced(params.forced) if params.model == "auto" else None,
+        selection=read_forced(params.fixed_parts) if params.model == "auto" else None,
     )
 
 
@@ -71,7 +71,7 @@ def read_forced(text: str) -> frozenset[str]:
     """Parts of the model that are not chosen; InputError for one that there is not."""
     forced = frozenset(filter(None, (name.strip() for name in text.split(","))))
     for name in sorted(forced.difference(PARTS)):
-        raise unknown_name("part of the model", name, PARTS, "--set inverse_render.forced")
+        raise unknown_name("part of the model", name, PARTS, "--set inverse_render.fixed_parts")
     return forced
 
 
