@@ -42,8 +42,8 @@ def specular_slopes(table: SpecularTransfer, towards: np.ndarray, roughness: flo
     ends = [roughness * float(np.exp(side * _LOG_STEP)) for side in (-1.0, 1.0)]
 
     def tabulate(view: np.ndarray, bits: np.ndarray, blocked: np.ndarray) -> None:
-        alphas = (table.alpha2(end) for end in ends)
-        _tabulate_slopes(table.normals, view, *alphas, table.directions, table.visible, bits, blocked)
+        narrower, wider = (table.alpha2(end) for end in ends)
+        _tabulate_slopes(table.normals, view, narrower, wider, table.directions, table.visible, bits, blocked)
 
     def split(part: slice, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         narrower, wider = (table.split_sum(part, view, end) for end in ends)

@@ -84,8 +84,9 @@ def specular_reflection(
     result, blocked = np.zeros((len(table), light.shape[1]), np.float32), np.zeros(len(table), np.float32)
     if table.resolves(roughness):
         channels = np.ascontiguousarray(light.T)
-        where = table.normals, towards, table.alpha2(roughness), table.directions, table.visible
-        _sum_lobes(*where, channels, result, blocked)
+        _sum_lobes(
+            table.normals, towards, table.alpha2(roughness), table.directions, table.visible, channels, result, blocked
+        )
     else:
         for part in blocks_of(table):
             every, seen = table.split_sum(part, towards[part], roughness)

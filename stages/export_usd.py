@@ -170,8 +170,10 @@ def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, frames
     if not job.params.views:
         return None
     cameras, moves = held_out_cameras(poses, frames.intrinsics, frames.size, solve), light_moves(job, frames.moves)
-    clip = envmap, poses["camera_from_head"], moves
-    views = make_views(mesh, maps, *clip, job.params.view_size, cameras, job.progress)
+    views = make_views(
+        mesh, maps, envmap, camera_from_head=poses["camera_from_head"], moves=moves, pixels=job.params.view_size,
+        held_out=cameras, progress=job.progress,
+    )
     (job.out / "views").mkdir()
     pictures = {f"novel_{name}": picture for name, picture in views.novel.items()}
     pictures |= {f"relit_{name}": picture for name, picture in views.relit.items()}

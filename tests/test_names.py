@@ -1,7 +1,7 @@
 """One name stands for one thing: what the code calls its classes."""
 
 import ast
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 
 REPOSITORY = Path(__file__).parent.parent
@@ -23,3 +23,28 @@ def test_no_class_name_is_defined_twice():
                 places[node.name].append(f"{path}:{node.lineno}")
     assert len(places) > 100
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
+def packed_arguments(tree):
+    """Lines of calls that unpack (* or **) a name which the same function bound to a tuple or dictionary written out
+    and reads nowhere else: arguments that were packed to save lines. Options that several calls share, a size, a range,
+    zip(*rows) or a record of a file are none."""
+    for function in ast.walk(tree):
+        if not isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            continue
+        nodes = list(ast.walk(function))
+        written_out = {
+            target.id for node in nodes if isinstance(node, ast.Assign) for target in node.targets
+            if isinstance(target, ast.Name) and isinstance(node.value, (ast.Tuple, ast.Dict))
+        }
+        reads = Counter(node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load))
+        for call in (node for node in nodes if isinstance(node, ast.Call)):
+            starred = [part.value for part in call.args if isinstance(part, ast.Starred)]
+            starred += [part.value for part in call.keywords if part.arg is None]
+            if any(isinstance(v, ast.Name) and v.id in written_out and reads[v.id] == 1 for v in starred):
+                yield call.lineno
+
+
+def test_arguments_are_written_at_the_call():
+    assert list(packed_arguments(ast.parse("def f():\n    more = 1, 2\n    g(*more)\n    h(*zip(*rows))"))) == [3]
+    assert [f"{path}:{line}" for path, tree in modules() for line in sorted(set(packed_arguments(tree)))] == []

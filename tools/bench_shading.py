@@ -224,8 +224,9 @@ def chart(path: Path, rows: list[dict]) -> None:
             own = [row for row in rows if (row["mesh"], row["quantity"]) == (mesh, way)]
             percent = np.array([100.0 * max(0.0, float(row["rms"])) for row in own])
             curves[f"{mesh}: {way.replace('_', ' ')}"] = np.where(percent < LARGEST_SHOWN, percent, np.nan)
-    options = {"x_label": "roughness", "y_label": "rms error of the highlight, %", "from_zero": True}
-    save_line_chart(path, ROUGHNESSES, curves, **options)
+    save_line_chart(
+        path, ROUGHNESSES, curves, x_label="roughness", y_label="rms error of the highlight, %", from_zero=True
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -121,8 +121,10 @@ def synthesize(destination: Path, settings: SynthesisSettings, processes: int) -
         _write_relight(destination / "relight", settings, scene, shots[settings.frames:], pictures)
     write_json(destination / "synthesis.json", asdict(settings))
     # Last, so that an interrupted run leaves no subject.
-    lens = settings.focal_mm, SENSOR_MM * width / settings.size
-    synth_output.write_description(destination, camera, *lens, settings.frames, FPS, settings.video)
+    synth_output.write_description(
+        destination, camera, focal_mm=settings.focal_mm, sensor_mm=SENSOR_MM * width / settings.size,
+        frames=settings.frames, fps=FPS, video=settings.video,
+    )
 
 
 def _write_clip(destination: Path, settings: SynthesisSettings, camera: PinholeCamera, truth: np.ndarray,

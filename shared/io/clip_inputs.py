@@ -77,8 +77,10 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
     three poses belong to sampled frames.
     """
     tracked_poses = load_arrays(tracked / "poses.npz")
-    lens = {"intrinsics": tracked_poses["intrinsics_crop"], "intrinsics_source": tracked_poses["intrinsics"]}
-    frames = replace(FrameSet.open(sampled), **lens)
+    frames = replace(
+        FrameSet.open(sampled), intrinsics=tracked_poses["intrinsics_crop"],
+        intrinsics_source=tracked_poses["intrinsics"]
+    )
     path = Path(mesh_path) if mesh_path else tracked / "mesh.npz"
     mesh = read_obj(path) if path.suffix == ".obj" else load_mesh(path)
     segment = load_arrays(path).get("face_segment") if path.suffix == ".npz" else None

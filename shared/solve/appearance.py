@@ -137,9 +137,14 @@ class AppearanceSolver(SampleErrors):
         log_light = np.repeat(np.log(irradiance / open_share * np.array(levels)), 6 * resolution**2, axis=0)
         points, nodes = len(self.capture.points), len(self.capture.nodes.points)
         specular = self.settings.specular_prior[0] if self.settings.specular else 0.0
-        everywhere = (np.tile(albedo, (count, 1)) for count in (points, nodes))
-        model = make_light_model("cubemap", resolution, len(self.light_frames))
-        return AppearanceState(log_light, model, specular, self.settings.roughness, *everywhere)
+        return AppearanceState(
+            params=log_light,
+            light_model=make_light_model("cubemap", resolution, len(self.light_frames)),
+            specular=specular,
+            roughness=self.settings.roughness,
+            albedo=np.tile(albedo, (points, 1)),
+            node_albedo=np.tile(albedo, (nodes, 1)),
+        )
 
     def start_from(self, state: AppearanceState) -> None:
         """Light, specular intensity and roughness of a state of other points; the albedo is its typical one."""

@@ -40,10 +40,10 @@ model (an expression that changes, a palette of few colours) they can lead away 
 @dataclass(frozen=True)
 class Solution:
     """The last State of those that are best by held-out residual; iterations: one record per step; fitted and held_out:
-    its residuals; gloss: where roughness varies over the skin, how, and gloss_record what the held-out frames said to
-    that; trusted: whether highlights took part to the end; frame_errors [F]: each frame's mean absolute residual;
-    local_specular: where the specular intensity varies with the face's segments, how; light_weights: of several lights,
-    how much samples of each count against those of the light that the model follows best."""
+    its residuals; local_roughness_fit: where roughness varies over the skin, how, and roughness_record what the
+    held-out frames said to that; trusted: whether highlights took part to the end; frame_errors [F]: each frame's mean
+    absolute residual; local_specular: where the specular intensity varies with the face's segments, how; light_weights:
+    of several lights, how much samples of each count against those of the light that the model follows best."""
 
     state: AppearanceState
     iterations: tuple[dict, ...]
@@ -122,9 +122,11 @@ def fit_appearance(
                     break
             last, last_fitted = judged, record["fitted"]
     _, record, state, by_frame = best
-    errors = record["fitted"], record["held_out"]
-    light_weights = tuple(record.get("light_trust", ()))
-    return Solution(state, tuple(records), *errors, trusted=trusts, frame_errors=by_frame, light_weights=light_weights)
+    return Solution(
+        state, tuple(records), fitted=record["fitted"], held_out=record["held_out"], trusted=trusts,
+        frame_errors=by_frame,
+        light_weights=tuple(record.get("light_trust", ())),
+    )
 
 
 def _judged(record: dict, name: str, count: float) -> float:

@@ -231,8 +231,10 @@ class ModelSelection:
         if settings.specular and start.state.specular == 0.0:
             fresh = replace(start.state, specular=settings.specular_prior[0], roughness=settings.roughness)
             start, keeps_start, shapes = replace(start, state=fresh, trusted=True), False, True
-        how = {"least": FINE_MOVES if fine else MOVES, "shapes": settings.specular and shapes}
-        solution = fit_appearance(capture, settings, start=start, keep_start=keeps_start, **how)
+        solution = fit_appearance(
+            capture, settings, start=start, keep_start=keeps_start, least=FINE_MOVES if fine else MOVES,
+            shapes=settings.specular and shapes,
+        )
         errors = solution.frame_errors[~capture.fitted]
         return Trial(model, solution, errors, time.perf_counter() - begun)
 

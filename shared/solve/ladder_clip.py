@@ -27,7 +27,8 @@ anyway."""
 
 @dataclass(frozen=True)
 class SelectedModel:
-    """The clip with the mesh that was chosen, what is left to solve, a solution to start from, how its gloss varies,
+    """The clip with the mesh that was chosen, what is left to solve, a solution to start from, how its
+    specular terms vary,
     what became of the mesh, and the record of the candidates."""
 
     inputs: InverseInputs
@@ -141,8 +142,10 @@ class _ClipSelection:
         appearance = below.model.applied(self.settings.appearance)
         known = Reflectance.of(below.solution, self.small.precomputed[appearance.visibility])
         frames = frames_of(tracked, self.settings, shape.frames, self.fitted)
-        how = appearance, self.small.sizes, shape, self.progress, self.note
-        refined = refine_shape(tracked, frames, known, *how, begun=None if below_is_tracked else self.small.inputs)
+        refined = refine_shape(
+            tracked, frames, reflectance=known, appearance=appearance, sizes=self.small.sizes, settings=shape,
+            progress=self.progress, note=self.note, begun=None if below_is_tracked else self.small.inputs,
+        )
         small = SmallClip(refined, self.settings, self.fitted, self.chart, self.progress)
         selection = self._selection(small)
         selection.begin(below.model, below.solution)
@@ -173,5 +176,8 @@ class _ClipSelection:
         appearance = replace(appearance, local_roughness=local, fit_roughness=False)  # model selection found it
         widths = settings.specular_widths if "specular" in forced else POOLING[self.variation.specular]
         settings = replace(settings, appearance=appearance, shape=None, specular_widths=widths)
-        found = self.variation, self.shape_record, tuple(self.candidates)
-        return SelectedModel(self.small.inputs, settings, present.solution, *found)
+        return SelectedModel(
+            self.small.inputs, settings, start=present.solution, variation=self.variation,
+            shape_record=self.shape_record,
+            candidates=tuple(self.candidates),
+        )

@@ -52,8 +52,9 @@ def solve_light(
                                note)
         viewer_then = SurfaceViewer.of(refined.mesh)
         precomputed_then = precompute_transfer(viewer_then, settings.sizes, settings.appearance.visibility)
-        more = viewer_then, precomputed_then, fitted, chart, progress, note, solution
-        then, capture_then = _fit_light(refined, settings, *more)
+        then, capture_then = _fit_light(
+            refined, settings, viewer_then, precomputed_then, fitted, chart, progress, note, start=solution
+        )
         tracked, shape_record = solution, judge_shape(solution, then) | {"stopped_vertices": refined.stopped}
         note(f"refined mesh: {shape_record}")
         if shape_record["refined"]:
@@ -78,8 +79,10 @@ def _fit_light(
     moves, count = settings.appearance.light_moves(inputs.moves), settings.sizes.points
     capture = replace(capture_skin(inputs, viewer, precomputed, frames, moves, count, progress), chart=chart)
     selected = settings.selection is not None and start is not None
-    step = (lambda record: note(_describe(record))), start, selected
-    return fit_appearance(capture, settings.appearance, *step), capture
+    solution = fit_appearance(
+        capture, settings.appearance, report=lambda record: note(_describe(record)), start=start, keep_start=selected
+    )
+    return solution, capture
 
 
 def _describe(record: dict) -> str:

@@ -99,8 +99,10 @@ class ReliefSums:
 
     def add(self, samples: LinearSamples, residual: np.ndarray) -> None:
         """Samples with the residuals [n, 3] to explain."""
-        seen = samples.rows, samples.irradiance, samples.derivative, residual, samples.weight
-        _add_products(*seen, self.per_channel, self.together)
+        _add_products(
+            samples.rows, samples.irradiance, samples.derivative, residual, samples.weight, self.per_channel,
+            self.together
+        )
 
     def equations(self) -> ReliefEquations:
         """With the albedo projected out."""

@@ -74,7 +74,7 @@ def noise_factor(
         shown = np.minimum(tracks.seen[:, odd].sum(1), tracks.seen[:, ~odd].sum(1)) >= LEAST_HALF
         if shown.sum() < 3:
             continue
-        halves = [
+        first, second = [
             adjust(
                 tracks.subset(shown, half),
                 solution.camera_from_points[shown],
@@ -85,7 +85,7 @@ def noise_factor(
             ).camera_from_points[:, :3, :3]
             for half in (odd, ~odd)
         ]
-        apart = rotations_apart(*halves)
+        apart = rotations_apart(first, second)
         distance = np.einsum("fi,fi->f", apart, np.linalg.solve(4.0 * covariance[shown], apart[..., None])[..., 0])
         ratios.append(float(np.sqrt(np.median(distance) / CHI_SQUARED_MEDIAN_3)))
     return max(ratios)

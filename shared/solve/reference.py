@@ -200,11 +200,11 @@ class ReferenceSolver:
         drawn[visible] = True
         near_by = np.nonzero(drawn[pairs.near] | drawn[pairs.far])[0]
         pixels = np.unique(np.concatenate([visible, pairs.near[near_by], pairs.far[near_by]]))
-        rows = [
+        near, far = [
             torch.from_numpy(np.searchsorted(pixels, side[near_by])).to(self.device) for side in (pairs.near, pairs.far)
         ]
         found = self.shade(pose, pixels, hits, geometry, generator)
-        found = blend(found, *rows, crossing[torch.from_numpy(near_by).to(self.device)])
+        found = blend(found, near, far, crossing[torch.from_numpy(near_by).to(self.device)])
         found = found[torch.from_numpy(np.searchsorted(pixels, visible)).to(self.device)]
         image = (found - self._tensor(colours[visible])).abs().mean()
         return {"image": image, "mask": self._mask_loss(hits, pairs, crossing, person, near_border)}

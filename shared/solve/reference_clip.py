@@ -73,8 +73,8 @@ def make_start(average: Average, skin: np.ndarray, white_sigma: float, specular:
     irradiance = np.exp(most_likely_irradiance(np.log(radiance), white_sigma))
     albedo = np.clip(average.colours / irradiance, 0.0, 1.0)
     grey = albedo.mean(1) if specular else np.zeros(len(albedo))
-    maps = (surface.dilated(surface.to_image(values.astype(np.float32))) for values in (albedo, grey))
-    return Start(irradiance, *maps)
+    albedo, grey = (surface.dilated(surface.to_image(values.astype(np.float32))) for values in (albedo, grey))
+    return Start(irradiance, albedo, grey)
 
 
 def solve_by_reference(

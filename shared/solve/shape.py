@@ -79,8 +79,11 @@ class Reflectance:
     def of(solution: Solution, precomputed: PrecomputedTransfer) -> Reflectance:
         """That of a solved appearance."""
         state = solution.state
-        known = state.light, state.specular, state.roughness, precomputed.nodes, state.node_albedo
-        return Reflectance(*known, solution.local_roughness_fit, solution.light_weights)
+        return Reflectance(
+            light=state.light, specular=state.specular, roughness=state.roughness, nodes=precomputed.nodes,
+            node_albedo=state.node_albedo, local_roughness_fit=solution.local_roughness_fit,
+            light_weights=solution.light_weights,
+        )
 
 
 @dataclass(frozen=True)

@@ -112,9 +112,11 @@ class NormalEquations:
         """irradiance, reflection, robust, shadow [n, 3] at samples.rows; robust: extra weight per channel; shadow:
         standard deviation of the modelled radiance, since borders of shadows may lie elsewhere; None: of none."""
         shadow = np.zeros_like(irradiance) if shadow is None else shadow
-        saturation, noise = samples.saturation, (np.float32(self.noise.absolute), np.float32(self.noise.relative))
-        seen = samples.rows, samples.weight, samples.colours, saturation, irradiance, reflection, robust, shadow
-        _add_samples(*seen, *noise, self.sums, self.clipped_ee)
+        absolute, relative = np.float32(self.noise.absolute), np.float32(self.noise.relative)
+        _add_samples(
+            samples.rows, samples.weight, samples.colours, samples.saturation, irradiance, reflection, robust, shadow,
+            absolute, relative, self.sums, self.clipped_ee,
+        )
 
     def solve_albedo(self, specular: np.ndarray, fallback: np.ndarray, pull: float | np.ndarray) -> np.ndarray:
         """Albedo [T, 3] for given specular [T]; fallback [T, 3] acts with precision pull, a number or [T, 3]."""

@@ -112,8 +112,10 @@ class TexturePass:
         some = fitted[spread_frames(len(fitted), FIRST_PASS_FRAMES, self.light_index[fitted])]
         (first,) = self._close(self._accumulate(None, some, "texture, first pass"), [mean])
         evidence = self._accumulate(first, fitted, "texture, second pass")
-        prior = self.specular, self.sigma
-        pooled = [pooled_specular(self.surface, evidence.equations, width, *prior) for width in widths]
+        pooled = [
+            pooled_specular(self.surface, evidence.equations, width, mean=self.specular, sigma=self.sigma)
+            for width in widths
+        ]
         candidates = self._close(evidence, pooled)
         errors = self.held_out_errors(candidates)
         best = int(np.argmin(errors))
@@ -126,8 +128,8 @@ class TexturePass:
         borders = [BorderSums(len(self.surface), self.viewer.error_mm) for _ in self.systematic]
         ahead = read_ahead(map(self.view, self.progress(frames, label)))
         for f, view in zip(frames, ahead, strict=True):
-            sums = parts[self.light_index[f]], borders[self.light_index[f]]
-            self._share_out(view, lambda lit, sums=sums: self._add(material, *sums, lit))
+            part, border = parts[self.light_index[f]], borders[self.light_index[f]]
+            self._share_out(view, lambda lit, part=part, border=border: self._add(material, part, border, lit))
         for part, trust in zip(parts, self.light_weights, strict=True):
             part.scale(trust)
         systematic = [error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
