@@ -120,7 +120,7 @@ def test_samples_count_by_how_well_their_light_knows_the_point(pair):
     plain = solver.precision.clone()
     for _ in range(8):
         step = LightStep(solver)
-        step.take()
+        step.update()
         step.resolve_scale()
         trust = weigh_samples(solver, step.irradiance, solver.model(step.irradiance, step.reflection))
     assert max(trust) == 1.0 and min(trust) > 0.0
