@@ -194,7 +194,7 @@ def read_clips(job: Job) -> tuple:
              "solver": params.solver == "reference"}
     for name in (name for name, is_given in given.items() if is_given and job.clips):
         raise InputError("works on one clip only", where=f"--set inverse_render.{name}", got=f"{len(job.clips)} clips",
-                         mend="leave it out, or make a subject of one clip")
+                         hint="leave it out, or make a subject of one clip")
     folders = [(job.input("sample_frames", clip), job.input("track_landmarks", clip)) for clip in job.clips or ("",)]
     return tuple(read_inputs(*pair, params.mesh, params.poses) for pair in folders)
 
@@ -267,7 +267,7 @@ def check(job: Job) -> None:
             raise LimnError(f"{name} leaves [0, {highest:g}]: {image.min():.3f} .. {image.max():.3f}")
     if not (maps["confidence"] > 0.5).mean() > 0.01:
         raise InputError("the clip determines less than a hundredth of the map", where=str(job.subject.folder),
-                         mend="film with more light, sharper, or with a wider turn")
+                         hint="film with more light, sharper, or with a wider turn")
     record = read_json(job.out / "solve.json")
     others = {job.out / "clips" / clip["name"]: clip for clip in record.get("clips", ())[1:]}
     for folder, clip in ({job.out: record} | others).items():

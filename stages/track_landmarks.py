@@ -244,7 +244,7 @@ def run(job: Job) -> None:
             where=frames.source_name,
             got=f"{len(used)} frames with landmarks",
             expected="3 or more",
-            mend="film one head, facing the camera at the start, 200 px wide or more",
+            hint="film one head, facing the camera at the start, 200 px wide or more",
         )
     clip = build_clip(job, frames, used, landmarks_px, given_poses)
     track = track_head(clip, model, read_settings(job, frames.focal_known), job.progress, job.note)

@@ -1,8 +1,11 @@
 """One name stands for one thing: what the code calls its classes."""
 
 import ast
+import inspect
 from collections import Counter, defaultdict
 from pathlib import Path
+
+from shared.errors import InputError
 
 REPOSITORY = Path(__file__).parent.parent
 ROOMS = ("shared", "stages", "tools")
@@ -48,3 +51,15 @@ def packed_arguments(tree):
 def test_arguments_are_written_at_the_call():
     assert list(packed_arguments(ast.parse("def f():\n    more = 1, 2\n    g(*more)\n    h(*zip(*rows))"))) == [3]
     assert [f"{path}:{line}" for path, tree in modules() for line in sorted(set(packed_arguments(tree)))] == []
+
+
+def test_errors_are_raised_with_the_words_that_they_know():
+    """An error's own line would else be a TypeError, seen only by whom it should have helped."""
+    known = set(inspect.signature(InputError).parameters)
+    calls = [
+        (path, call) for path, tree in modules() for call in ast.walk(tree)
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "InputError"
+    ]
+    assert len(calls) > 100
+    assert [f"{path}:{call.lineno}: {word.arg}" for path, call in calls for word in call.keywords
+            if word.arg is not None and word.arg not in known] == []

@@ -93,7 +93,7 @@ class Opened:
 def no_access(case: SubjectCase, error: OSError) -> InputError:
     """What to say where the subject's files cannot be read or written."""
     return InputError("cannot be read or written", where=str(error.filename or case.run.root), got=error.strerror,
-                      mend="check permissions and disk, or write elsewhere with --out DIR")
+                      hint="check permissions and disk, or write elsewhere with --out DIR")
 
 
 def one_line(error: Exception) -> str:
@@ -107,7 +107,7 @@ def find_subjects(folders: Sequence[Path], list_file: Path | None = None) -> lis
     for folder in [*folders, *(_listed(list_file) if list_file else ())]:
         found += _subjects_in(folder) or [folder]
     if not found:
-        raise InputError("no subjects", mend="give folders with subject.yaml, a folder of such, or --list FILE")
+        raise InputError("no subjects", hint="give folders with subject.yaml, a folder of such, or --list FILE")
     return found
 
 
@@ -118,7 +118,7 @@ def _subjects_in(folder: Path) -> list[Path]:
     try:
         inside = sorted(folder.iterdir())
     except OSError as error:
-        raise InputError("cannot be read", where=str(folder), got=error.strerror, mend="check permissions") from error
+        raise InputError("cannot be read", where=str(folder), got=error.strerror, hint="check permissions") from error
     return [path for path in inside if _is_subject(path)]
 
 
@@ -150,7 +150,7 @@ def open_cases(folders: Sequence[Path], out: Path | None) -> Opened:
         except InputError as error:
             opened.faults.append((folder, error))
     roots = [case.run.root.resolve() for case in opened.cases]
-    twice = [InputError("given twice, or two subjects of one name", where=str(case.subject.folder), mend="rename one")
+    twice = [InputError("given twice, or two subjects of one name", where=str(case.subject.folder), hint="rename one")
              for i, case in enumerate(opened.cases) if roots[i] in set(roots[:i])]
     if twice:
         raise InputErrors(twice)

@@ -55,7 +55,7 @@ def open_subject(folder: Path) -> Subject:
             raise InputError("could not be rendered", where=str(folder))
     subject = load_subject(folder)
     if not (folder / "gt").is_dir():
-        raise InputError("no ground truth", where=str(folder), expected="a gt/ folder", mend="see tools/synthesize.py")
+        raise InputError("no ground truth", where=str(folder), expected="a gt/ folder", hint="see tools/synthesize.py")
     return subject
 
 

@@ -54,7 +54,7 @@ def report_path(case: SubjectCase, plans: Mapping[str, StagePlan]) -> tuple[Path
     """The report and remarks about it; InputError where there is none."""
     path = case.run.root / "export" / "report.html"
     if not path.is_file():
-        raise InputError("no report yet", where=str(path.parent), mend=f"make it with: limn run {case.subject.folder}")
+        raise InputError("no report yet", where=str(path.parent), hint=f"make it with: limn run {case.subject.folder}")
     stale = [name for name, plan in plans.items() if plan.state != "current"]
     return path, [f"{case.name}: not up to date: {', '.join(stale)}"] if stale else []
 

@@ -107,4 +107,4 @@ def write_summary(path: Path, outcomes: Sequence[Outcome], started: str, seconds
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise InputError("the summary cannot be written", where=str(path), got=error.strerror,
-                         mend="name another place with --summary FILE") from error
+                         hint="name another place with --summary FILE") from error

@@ -55,7 +55,7 @@ def write_overview(path: Path, outcomes: Sequence[Outcome], pipeline: Pipeline) 
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise InputError("the overview cannot be written", where=str(path), got=error.strerror,
-                         mend="choose another place") from error
+                         hint="choose another place") from error
 
 
 def page_beside(summary: Path) -> Path:

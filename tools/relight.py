@@ -73,7 +73,7 @@ def _turned_shot(asset: Asset, i: int, yaw: float, pitch: float, options: argpar
 def _clip_shot(asset: Asset, frame: int, options: argparse.Namespace) -> RelightShot:
     """A frame of the clip through its own lens, whose axis is taken for the picture's middle."""
     if asset.poses is None:
-        raise InputError("a mesh has no frames", where="--frames", mend="use --view or --turntable")
+        raise InputError("a mesh has no frames", where="--frames", hint="use --view or --turntable")
     found = np.nonzero(asset.frame_index == frame)[0]
     if len(found) == 0:
         low, high = int(asset.frame_index.min()), int(asset.frame_index.max())
@@ -157,7 +157,7 @@ def run(options: argparse.Namespace) -> list[Path]:
     given = {name: getattr(options, name) for name in CLAY if getattr(options, name) is not None}
     if given and options.asset.is_dir():
         raise InputError(
-            "a result has maps of its own", where=f"--{next(iter(given))}", mend="leave it out, or name a mesh"
+            "a result has maps of its own", where=f"--{next(iter(given))}", hint="leave it out, or name a mesh"
         )
     asset = open_asset(options.asset, **{**CLAY, **given})
     lights = {Path(name).stem: read_light(name, asset) for name in options.light}

@@ -76,7 +76,7 @@ def score(
     """
     subject, export = Path(subject), Path(export)
     if not (subject / "gt").is_dir():
-        raise InputError("no ground truth", where=str(subject), expected="a gt/ folder", mend="see tools/synthesize.py")
+        raise InputError("no ground truth", where=str(subject), expected="a gt/ folder", hint="see tools/synthesize.py")
     truth = load_arrays(subject / "gt" / "poses.npz")
     result = load_result(export, camera_intrinsics(subject))
     common = [i for i in sorted(result.poses) if i < len(truth["camera_from_head"])]

@@ -90,7 +90,7 @@ def verdicts(work: Path) -> list[dict]:
     """A row for each perturbation and severity that has been run, with its verdict."""
     zero = known_row(work, StressCase())
     if zero is None or zero["exit"]:
-        raise InputError("the unspoilt case has no result", where=str(work), mend="run without --table first")
+        raise InputError("the unspoilt case has no result", where=str(work), hint="run without --table first")
     rows = []
     for perturbation in PERTURBATIONS:
         known = ((severity, known_row(work, perturbation.make(severity))) for severity in perturbation.severities)

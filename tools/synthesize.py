@@ -96,7 +96,7 @@ PRESETS = {
 def synthesize(destination: Path, settings: SynthesisSettings, processes: int) -> None:
     """Makes the subject in `destination`, which may not hold one yet. Errors: InputError."""
     if (destination / "subject.yaml").exists():
-        raise InputError("holds a subject already", where=str(destination), mend="choose another folder or remove it")
+        raise InputError("holds a subject already", where=str(destination), hint="choose another folder or remove it")
     head = random_head(head_model(settings.level), settings.seed, settings.eyes == "closed")
     materials = SkinPainter(head, settings.texture, settings.seed).paint(Complexion(tone=settings.tone))
     materials = replace(materials, specular=settings.gloss * materials.specular)

@@ -179,7 +179,7 @@ def measured(command: Sequence[str], log: Path) -> dict[str, float]:
     if process.returncode:
         words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no message"]
         ended = f"exit code {process.returncode}; its log: {log}"
-        raise InputError("failed", where=" ".join(command[:6]), got=words[-1], mend=ended)
+        raise InputError("failed", where=" ".join(command[:6]), got=words[-1], hint=ended)
     others = max(0.0, (_busy_seconds() - busy - cpu) / wall)
     return {"wall_s": round(wall, 3), "cpu_s": round(cpu, 3), "others": round(others, 2)}
 

@@ -255,7 +255,7 @@ def default_summary(subjects: Sequence[Path], out: Path | None, given: Path | No
     free = [folder / name for name in names
             if all(path not in results and not path.is_dir() for path in (folder / name, page_beside(folder / name)))]
     if not free:
-        raise InputError("no free name for the summary", where=str(folder), mend="name a place with --summary FILE")
+        raise InputError("no free name for the summary", where=str(folder), hint="name a place with --summary FILE")
     if free[0].name != names[0]:
         _say(f"limn: {folder / names[0]}, or the page beside it, is a folder: the summary goes to {free[0]}")
     return free[0]

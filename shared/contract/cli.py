@@ -110,7 +110,7 @@ class OneLineParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> None:
         """argparse's hook for a bad command line. InputError always."""
-        raise InputError(message, mend=f"see {self.prog} --help")
+        raise InputError(message, hint=f"see {self.prog} --help")
 
 
 def make_parser(stage: Stage) -> argparse.ArgumentParser:
@@ -156,11 +156,11 @@ def _part(stage: Stage, subject: Subject, run: RunFolder, clip: str | None, join
     """What of a subject with several clips the stage works on: all of it, or the one clip that is named."""
     if joint:
         if clip is not None:
-            raise InputError("works on all clips together", where=f"{stage.name} --clip", mend="leave --clip out")
+            raise InputError("works on all clips together", where=f"{stage.name} --clip", hint="leave --clip out")
         return subject, run
     if clip is None:
         raise InputError("works on one clip at a time", where=stage.name, got=f"{len(subject.clips)} clips",
-                         mend=f"add --clip NAME, one of {', '.join(clip.name for clip in subject.clips)}")
+                         hint=f"add --clip NAME, one of {', '.join(clip.name for clip in subject.clips)}")
     return subject.clip(clip, "--clip"), run.of_clip(clip)
 
 

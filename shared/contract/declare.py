@@ -194,7 +194,7 @@ class Stage:
         for name in values:
             if name in renamed:
                 raise InputError(f"parameter {self.name}.{name} has another name now", where=where,
-                                 mend=f"write {self.name}.{renamed[name]}")
+                                 hint=f"write {self.name}.{renamed[name]}")
             if name not in known:
                 raise unknown_name("parameter", f"{self.name}.{name}", [f"{self.name}.{key}" for key in known], where)
         return {name: known[name].parse(value, f"{where}: {self.name}.{name}") for name, value in values.items()}

@@ -84,16 +84,16 @@ def check_decodable(path: Path | str, most_pixels: int = MAX_PIXELS) -> ExrPart:
     for part in parts:
         if part.deep:
             raise InputError("a deep EXR", where=where, expected="one sample a pixel",
-                             mend="flatten it: oiiotool IN.exr --flatten -o OUT.exr")
+                             hint="flatten it: oiiotool IN.exr --flatten -o OUT.exr")
         check_size(*part.size, where, smallest=1, largest=most_pixels)
         if any(edge > 4096 for edge in part.values.get("tiles", (1, 1))):
             raise InputError("the tiles of the EXR are too large", where=where, got=part.values["tiles"],
-                             expected="4096 px or less each way", mend="oiiotool IN.exr --scanline -o OUT.exr")
+                             expected="4096 px or less each way", hint="oiiotool IN.exr --scanline -o OUT.exr")
     needed, most = sum(part.bytes() for part in parts), PIXEL_BYTES * most_pixels
     if needed > most:
         raise InputError("the EXR is too large once decoded", where=where, expected=f"{most >> 20} MB or less",
                          got=f"{sum(len(part.channels) for part in parts)} channels in {len(parts)} parts, "
-                             f"{needed >> 20} MB", mend=f"keep the colour only: {_KEEP_CHANNELS}")
+                             f"{needed >> 20} MB", hint=f"keep the colour only: {_KEEP_CHANNELS}")
     return parts[0]
 
 
@@ -108,7 +108,7 @@ def _parts(data: bytes, where: str) -> list[ExrPart]:
             return parts
         if len(parts) > MOST_PARTS:
             raise InputError("too many parts in the EXR", where=where, expected=f"{MOST_PARTS} or fewer",
-                             mend=f"keep the colour only: {_KEEP_CHANNELS}")
+                             hint=f"keep the colour only: {_KEEP_CHANNELS}")
 
 
 def _attributes(data: bytes, at: int) -> tuple[dict[str, tuple[str, bytes]], int]:
@@ -165,5 +165,5 @@ def _channels(raw: bytes, where: str) -> tuple[Channel, ...]:
         at += 16
         if len(found) > MOST_CHANNELS:
             raise InputError("too many channels in the EXR", where=where, expected=f"{MOST_CHANNELS} or fewer",
-                             mend=f"keep the colour only: {_KEEP_CHANNELS}")
+                             hint=f"keep the colour only: {_KEEP_CHANNELS}")
     return tuple(found)

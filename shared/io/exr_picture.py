@@ -98,7 +98,7 @@ class ExrPicture:
         if negative > NEGATIVE_LIMIT:
             raise InputError("the EXR holds negative light", got=f"{negative:.0%} of its values' sum",
                              expected="scene-linear values above 0",
-                             mend="take black level and grading off, or map the gamut into Rec.709")
+                             hint="take black level and grading off, or map the gamut into Rec.709")
         if negative > NEGATIVE_WARNING:
             found.append(f"negative values count as zero: {negative:.1%} of the light in the first image")
         if self.matrix is not None:
@@ -153,13 +153,13 @@ def _check_attributes(part: ExrPart, where: str) -> None:
         (width, height), known = part.size, 0.1 < ratio < 10
         size = f" --resize {round(width * ratio)}x{height} --attrib PixelAspectRatio 1" if known else ""
         raise InputError("the EXR's pixels are not square", where=where, got=f"pixelAspectRatio {ratio:g}",
-                         expected="1", mend=f"scale the images to square pixels: oiiotool IN.exr{size} -o OUT.exr")
+                         expected="1", hint=f"scale the images to square pixels: oiiotool IN.exr{size} -o OUT.exr")
     if "envmap" in part.values:
         raise InputError("the EXR is an environment map", where=where, expected="a picture of a camera")
     space = str(part.values.get("colorInteropID", ""))
     if space and not space.startswith("lin_") and space not in ("data", "unknown"):
         raise InputError("the EXR is not linear", where=where, got=space, expected="scene-linear values",
-                         mend="oiiotool IN.exr --tocolorspace lin_rec709_scene -o OUT.exr")
+                         hint="oiiotool IN.exr --tocolorspace lin_rec709_scene -o OUT.exr")
 
 
 def _matrix(part: ExrPart, where: str) -> np.ndarray | None:
@@ -184,7 +184,7 @@ def _names(part: ExrPart, where: str) -> tuple[str, ...]:
     if not names:
         raise InputError("an EXR of other channels", where=where, got=", ".join(sorted(known)) or "none",
                          expected="R, G and B, or Y alone (not luminance and chroma)",
-                         mend="name the picture's own channels: oiiotool IN.exr --ch R=...,G=...,B=... -o OUT.exr")
+                         hint="name the picture's own channels: oiiotool IN.exr --ch R=...,G=...,B=... -o OUT.exr")
     if any(known[name].kind == 0 or known[name].step != (1, 1) for name in names):
         raise InputError("an EXR of other channels", where=where, got="integers, or channels of lower resolution",
                          expected="half or float, one value for each pixel")

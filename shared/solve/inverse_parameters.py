@@ -27,7 +27,7 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
     """All settings; checkpoint: the reference solver's own file, or None. InputError for what cannot go together."""
     if params.model == "auto" and params.solver == "reference":
         raise InputError("model=auto belongs to solver=transfer", where="--set inverse_render.model",
-                         mend="leave out one of the two; the reference solver takes visibility and specular as given")
+                         hint="leave out one of the two; the reference solver takes visibility and specular as given")
     appearance = AppearanceSettings(
         light_model=params.light_model,
         resolutions=tuple(n for n in (8, 16, 32) if n <= params.light_resolution) or (params.light_resolution,),
@@ -81,7 +81,7 @@ def read_reference(params: Parameters, checkpoint: Path | None = None) -> Refere
     own = {name.removeprefix(prefix): value for name, value in given.items() if name.startswith(prefix)}
     if own["device"] == "cuda" and not torch.cuda.is_available():
         raise InputError("no such device here", where="--set inverse_render.reference_device", got="cuda",
-                         mend="take cpu, or a machine and a build of torch with CUDA")
+                         hint="take cpu, or a machine and a build of torch with CUDA")
     samples = {name: own.pop(f"{name}_samples") for name in ("light", "cosine", "lobe")}
     weights = {name: own.pop(name) for name in ("mask", "laplacian", "white_light", "roughness_variation", "diffuse")}
     return ReferenceSettings(

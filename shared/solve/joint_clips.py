@@ -165,7 +165,7 @@ def place(main, clip, matches: Matches) -> Placed:
     if len(matches) < LEAST_MATCHES:
         raise InputError("the clips do not show the same skin", where=clip.frames.source_name,
                          got=f"{len(matches)} texels alike", expected=f"{LEAST_MATCHES} or more",
-                         mend="film one face, the same in all clips and sharp, or solve each clip by itself")
+                         hint="film one face, the same in all clips and sharp, or solve each clip by itself")
     chosen, poses = matches.thinned(MATCHES), clip.camera_from_head
     pixels = project(chosen.second, poses, clip.intrinsics)[0]
     towards = normalised(camera_centres(poses)[:, None] - chosen.second)

@@ -55,7 +55,7 @@ def average_texture(inputs, viewer: SurfaceViewer, size: int, frames: np.ndarray
         weight[samples.rows] += samples.weight
     seen = weight > 1e-3
     if not seen.any():
-        raise InputError("no frame shows the mesh", where="poses", mend="check the poses and the mesh")
+        raise InputError("no frame shows the mesh", where="poses", hint="check the poses and the mesh")
     colours = np.where(
         seen[:, None], total / np.maximum(weight, 1e-9)[:, None], np.median(total[seen] / weight[seen, None], axis=0)
     )

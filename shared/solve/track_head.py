@@ -158,7 +158,7 @@ def refuse_still_head(camera_from_head: np.ndarray) -> None:
             "the head does not turn",
             got=f"views that are {turned:.2f} degrees apart at most",
             expected=f"{LEAST_ROTATION_DEG:g} degrees or more, better 50",
-            mend="film a head that turns 25 degrees to each side; where a poster, a screen or somebody else shows a "
+            hint="film a head that turns 25 degrees to each side; where a poster, a screen or somebody else shows a "
             "larger face than the person's, cover it or cut it off",
         )
 
