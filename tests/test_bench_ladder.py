@@ -16,7 +16,7 @@ TABLE = [row("a", "auto", "tracked", 0.0103, 12.0), row("a", "least", "tracked",
          row("a", "cubemap_16", "tracked", 0.011, 30.0), row("a", "cubemap_16", "refined", 0.010, 60.0)]
 
 
-def test_the_ladder_is_compared_with_the_best_fixed_rung():
+def test_model_selection_is_compared_with_the_best_fixed_candidate():
     (found,) = compare(TABLE)
     assert found["best_fixed"] == "cubemap_16, refined"
     assert found["error_ratio"] == pytest.approx(1.03) and found["square_ratio"] == pytest.approx(1.03)
@@ -37,7 +37,7 @@ def test_rows_survive_the_table_and_are_not_measured_again(tmp_path, monkeypatch
     monkeypatch.setattr(bench_ladder, "measure", measure)
     monkeypatch.setattr(bench_ladder, "compile_loops", lambda: None)
     monkeypatch.setattr(bench_ladder, "read_inputs", lambda *folders: None)
-    arguments = ["--rungs", "auto", "least", "cubemap_16", "--set", "points=500", "--out", str(table)]
+    arguments = ["--candidates", "auto", "least", "cubemap_16", "--set", "points=500", "--out", str(table)]
     assert main([str(tmp_path / "a"), *arguments]) == 0
     assert measured == [("a", "cubemap_16", {"points": "500"})]
     assert len(read_rows(table)) == 4

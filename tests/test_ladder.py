@@ -67,14 +67,14 @@ def test_a_matte_evenly_lit_head_ends_low(matte):
     assert selection.present.errors.mean() < 1.5 * NOISE
 
 
-def test_a_glossy_hard_lit_head_climbs(glossy):
+def test_a_glossy_hard_lit_head_needs_more(glossy):
     selection, records = glossy
     assert selection.present.model.specular == "one_value"
     assert list(LIGHTS).index(selection.present.model.light) > list(LIGHTS).index("harmonics_2")
     assert selection.present.errors.mean() < 0.5 * records[0]["held_out"]
 
 
-def test_every_rung_is_on_the_record_with_its_error_and_seconds(glossy):
+def test_every_candidate_is_on_the_record_with_its_error_and_seconds(glossy):
     selection, records = glossy
     assert records[0]["part"] == "start" and records[0]["fall"] is None
     held_out = records[0]["held_out"]
@@ -172,7 +172,7 @@ def test_harmonics_are_passed_over_once_a_sun_serves(monkeypatch):
 
 
 @pytest.mark.parametrize(("saved", "worth"), [(0.01, False), (0.03, True)])
-def test_highlights_must_save_more_than_other_rungs(monkeypatch, saved, worth):
+def test_highlights_must_save_more_than_other_candidates(monkeypatch, saved, worth):
     found = tried_candidates(monkeypatch, lambda model: 1.0 - saved * (model.specular == "one_value"))
     assert ("one_value", worth) in found
 
@@ -291,7 +291,7 @@ def told(**changes):
     return Parameters({**STAGE.defaults(), **STAGE.parse(changes, "test")})
 
 
-def test_the_stage_climbs_only_when_told_to():
+def test_the_stage_selects_only_when_told_to():
     assert read_settings(told()).selection is None
     assert read_settings(told(model="auto")).selection == frozenset()
     assert read_settings(told(model="auto", fixed_parts="light, geometry")).selection == {"light", "geometry"}

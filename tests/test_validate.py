@@ -75,8 +75,8 @@ def chart_outside(folder):
 @pytest.mark.parametrize("spoil, hint", [
     (nothing, "no face found"), (cut_off, "cut off or damaged"), (sound, "no video stream"), (text, "not a video"),
     (chart_beyond, "the clip has no such frame"), (chart_outside, "corners outside the picture")])
-def test_the_stage_and_validate_say_the_same(tmp_path, capsys, degrade, hint):
-    subject = degrade(tmp_path / "anna")
+def test_the_stage_and_validate_say_the_same(tmp_path, capsys, spoil, hint):
+    subject = spoil(tmp_path / "anna")
     before = tree(subject)
     assert main(["validate", str(subject)]) == 2
     found = capsys.readouterr().err

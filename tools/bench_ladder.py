@@ -68,7 +68,7 @@ class Clock:
 
 
 def compile_loops() -> None:
-    """What is compiled at its first call must not count as the first rung's time."""
+    """What is compiled at its first call must not count as the first candidate's time."""
     up, directions = np.array([[0.0, 0.0, 1.0]], np.float32), fibonacci_sphere(64)
     table = SpecularTransfer(up, np.ones((1, 64), bool), directions)
     specular_tables(table, up[:, None], 0.5)
@@ -147,8 +147,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="*", type=Path)
     parser.add_argument("--out", type=Path, required=True, help="the table")
-    parser.add_argument("--rungs", nargs="*", default=list(CANDIDATES), choices=CANDIDATES)
-    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="parameters for every rung")
+    parser.add_argument("--candidates", nargs="*", default=list(CANDIDATES), choices=CANDIDATES)
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="parameters for every candidate")
     options = parser.parse_args(arguments)
     given = dict(setting.split("=", 1) for setting in options.set)
     rows = read_rows(options.out)

@@ -4,9 +4,9 @@ severity.
     python -m tools.stress WORK [--perturbations cap_lamp,glasses] [--minutes 6] [--docs docs]
     python -m tools.stress WORK --table [--docs docs]
 
-Makes each dial's subjects (stress_dials), runs Limn on them with small settings (stress_run), scores the results
-against the truth and passes the verdict by a stated rule (stress_judge): right, degraded and said so, or wrong and
-silent. Writes WORK/rows/, one file per case, and from them DOCS/stress.csv, stress.md and stress.svg; --table does
+Makes each perturbation's subjects (stress_dials), runs Limn on them with small settings (stress_run), scores the
+results against the truth and passes the verdict by a stated rule (stress_judge): right, degraded and said so, or wrong
+and silent. Writes WORK/rows/, one file per case, and from them DOCS/stress.csv, stress.md and stress.svg; --table does
 only that. A case that has a row of the same versions is not run again, so that a test that was stopped goes on;
 --minutes: no case begins later. Exit code 1 when a case is wrong and silent or failed.
 """
@@ -37,7 +37,7 @@ def code_version() -> str:
 
 
 def cases_of(perturbations: list[Perturbation]) -> list[tuple[str, StressCase]]:
-    """(name, case), the unspoilt one first, then every dial's most severe, last the mildest ones."""
+    """(name, case), the unchanged one first, then every perturbation's most severe, last the mildest ones."""
     most = max(len(perturbation.severities) for perturbation in perturbations)
     cases = [("unspoilt", StressCase())]
     for step in range(1, most + 1):
@@ -90,7 +90,7 @@ def verdicts(work: Path) -> list[dict]:
     """A row for each perturbation and severity that has been run, with its verdict."""
     zero = known_row(work, StressCase())
     if zero is None or zero["exit"]:
-        raise InputError("the unspoilt case has no result", where=str(work), hint="run without --table first")
+        raise InputError("the unchanged case has no result", where=str(work), hint="run without --table first")
     rows = []
     for perturbation in PERTURBATIONS:
         known = ((severity, known_row(work, perturbation.make(severity))) for severity in perturbation.severities)

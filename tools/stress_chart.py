@@ -33,7 +33,7 @@ def write_chart(rows: Sequence[dict], path: Path) -> None:
     legend = f'<g transform="translate(0 {lines * _HEIGHT + 8})">{_legend()}</g>'
     path.write_text(
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img" aria-label="scores over '
-        f'the severity of each dial"><style>{_STYLE}</style><rect width="100%" height="100%" fill="#fff"/>'
+        f'the severity of each perturbation"><style>{_STYLE}</style><rect width="100%" height="100%" fill="#fff"/>'
         f'{"".join(placed)}{legend}</svg>\n', encoding="utf-8")
 
 

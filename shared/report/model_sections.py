@@ -36,15 +36,15 @@ def selection_table(selection: Sequence[Mapping]) -> str:
     errors = ("held_out", "fall", "standard_error")
     rows = [[f"{row[key]:.6f}" if key in errors and row[key] is not None else number(row[key]).replace("_", " ")
              for key in keys] for row in selection]
-    note = ('<p class="note">The ladder, climbed on few points and frames: a rung stays where the error on frames that '
-            "were held out falls by more than its standard error. What it led to was then solved in full:</p>")
+    note = ('<p class="note">Tried on few points and frames: a candidate stays where the error on frames that were '
+            "held out falls by more than its standard error. The model that was chosen was then solved in full:</p>")
     return table(head, rows, numbers=(2, 3, 4, 6)) + note
 
 
 def solved_models(
     iterations: Sequence[Mapping], residuals: Mapping[str, object], model: Mapping[str, object]
 ) -> list[dict]:
-    """Rungs from what the solver logged: one per light model and resolution, one per width of the gloss.
+    """Models from what the solver logged: one per light model and resolution, one per width of the gloss.
 
     Errors are those of the last step of each; chosen: where model names it.
     """

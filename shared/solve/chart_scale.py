@@ -8,8 +8,7 @@ Two things about the chart are not known well, so several cases are weighed agai
 the corners and the patches, and the spread of the factor between them counts:
 
 - Its normal, from the grid's corners and the lens. Seen from afar, a plane and its mirror image about the line of
-sight
-  look alike, and a plane that faces the camera shows its tilt only to second order.
+  sight look alike, and a plane that faces the camera shows its tilt only to second order.
 - Its depth, since charts come in many sizes: some way before, beside or behind the head, which shades it differently.
 
 Reference: [Collins2014] (cv2.SOLVEPNP_IPPE).

@@ -1,4 +1,4 @@
-"""No more model than the scene needs: models of rising cost, climbed while held-out frames fit better for it.
+"""No more model than the scene needs: models of rising cost, tried while held-out frames fit better.
 
 Each part of the model has candidates of its own, from the least to the most:
 
@@ -39,21 +39,22 @@ LIGHTS = {
     "cubemap_16": ("cubemap", 16),
     "cubemap_32": ("cubemap", 32),
 }
-"""Model and resolution of each rung of the light."""
+"""Model and resolution of each candidate for the light."""
 VISIBILITIES = ("off", "on", "bounces")
 SPECULARS = ("none", "one_value")
 WORTHWHILE = 0.005
-"""Share of the error that a rung with more unknowns must save besides: as much as the solver leaves when it stops."""
+"""A candidate with more unknowns must lower the error by this share, too: as much as the solver leaves when it
+stops."""
 WORTHWHILE_SPECULAR = 0.02
-"""Likewise of the first highlights, the dearest of all rungs: three quarters of a fit's time."""
+"""The same for the first highlights, which cost most: three quarters of a fit's time."""
 PARTS = ("visibility", "specular", "light", "geometry", "roughness")
-"""What can be forced."""
+"""What can be fixed."""
 FEWEST_HELD_OUT = 3
 """Frames, below which differences between them have no standard error."""
 SELECTION_STEPS, MOVES = 8, 2
-"""Most steps from a rung to the next, and so many at least: the first from a light of another model can lead uphill."""
+"""Most and fewest steps from one candidate to the next: the first one from a light of another model can be worse."""
 SELECTION_PRECISION = (10, 0.03)
-"""Of a step of the light while climbing: what is chosen is solved again, with Settings.precision."""
+"""Of a step of the light while candidates are tried: the chosen model is solved again, with full precision."""
 FINE_LIGHTS, FINE_MOVES = ("cubemap_16", "cubemap_32"), 4
 """What these add, the shape of a lamp, only comes out in several steps of the whole solve's precision."""
 LOOK_AHEAD = 2
@@ -152,8 +153,8 @@ class ModelSelection:
             pass
 
     def _leap(self) -> bool:
-        """All parts at once, from a uniform light: shadows that cost nothing and yet do not serve mean that the climb
-        stands where no single part leads out, as under one hard lamp."""
+        """All parts at once, from a uniform light: shadows that cost nothing and yet do not serve mean that the
+        selection stands where no single part leads out, as under one hard lamp."""
         lights = self.candidates["light"]
         model = Model(self.candidates["visibility"][-1], self.candidates["specular"][-1],
                       next((name for name in lights if name.startswith("cubemap")), lights[-1]))
@@ -169,7 +170,7 @@ class ModelSelection:
         return better
 
     def begin(self, model: Model, start: Solution | None = None) -> None:
-        """Solves a model to climb from, from a solution or from a uniform light."""
+        """Solves a model to start from, from a solution or from a uniform light."""
         self.present = self._try(model, start)
         self.tried.add(model)
 
@@ -210,7 +211,7 @@ class ModelSelection:
         return 1 if part == "light" and self.present.model.light.startswith("cubemap") else LOOK_AHEAD
 
     def _at_bottom(self) -> bool:
-        """Whether nothing but the visibility has climbed."""
+        """Whether nothing but the visibility has gained."""
         return all(getattr(self.present.model, part) == self.candidates[part][0] for part in ("specular", "light"))
 
     def _try(self, model: Model, start: Solution | None) -> Trial:

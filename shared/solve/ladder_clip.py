@@ -107,7 +107,7 @@ class _ClipSelection:
         self.variation = SpecularVariation()
 
     def select(self) -> None:
-        """All parts; the result stands in small, ladder.present and gloss."""
+        """All parts; the result stands in small, selection.present and variation."""
         self.selection.select()
         if self.settings.shape is not None and self.small.inputs.face_segment is not None:
             self._select_geometry(self.settings.shape)

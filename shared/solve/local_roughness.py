@@ -32,7 +32,8 @@ WORTHWHILE = 0.002
 
 @dataclass(frozen=True)
 class SpecularEquations:
-    """Evidence on gloss of P points at R roughnesses: curvature and moment [R, P] of the specular intensity.
+    """Evidence on the specular terms of P points at R roughnesses: curvature and moment [R, P] of the specular
+    intensity.
 
     positions [P, 3] mm; logs [R]: log roughness, the clip's in the middle; specular: mean and precision of the
     intensity; shift: what log roughness is off by in the mean, to be taken away.
