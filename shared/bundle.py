@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.bundle_problem import BundleProblem, State, Tracks, moved
+from shared.bundle_problem import BundleProblem, BundleState, Tracks, moved
 from shared.geometry import project
 from shared.motion_prior import MotionPrior
 
@@ -69,7 +69,7 @@ def adjust(
         motion=motion,
         refine_focal=refine_focal,
     )
-    state = State(np.array(camera_from_points, np.float64), problem.anchor.copy())
+    state = BundleState(np.array(camera_from_points, np.float64), problem.anchor.copy())
     cost, damping = problem.cost(state), 1e-4
     for _ in range(max_iterations):
         system = problem.reduced_system(state)
@@ -118,7 +118,7 @@ def resect(
     for _ in range(iterations):
         cameras, rhs = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6))
         for chunk in problem.chunks():
-            block = problem.linearised(State(poses, problem.anchor), chunk)
+            block = problem.linearised(BundleState(poses, problem.anchor), chunk)
             cameras += block.cameras
             rhs += block.camera_rhs
         cameras[~solvable] = np.eye(6)
@@ -143,7 +143,7 @@ def place_points(
 ) -> BundleSolution:
     """Points alone, the poses held: N independent robust Gauss-Newton solutions. Arguments as in `adjust`."""
     problem = BundleProblem(tracks, points, intrinsics, loss_scale=loss_scale, prior_mm=prior_mm)
-    state = State(np.array(camera_from_points, np.float64), problem.anchor.copy())
+    state = BundleState(np.array(camera_from_points, np.float64), problem.anchor.copy())
     for _ in range(iterations):
         for chunk in problem.chunks():
             block = problem.linearised(state, chunk)
@@ -185,7 +185,7 @@ def pose_covariance(
         refine_focal=with_focal,
     )
     poses = solution.camera_from_points
-    system = problem.reduced_system(State(poses, solution.points))
+    system = problem.reduced_system(BundleState(poses, solution.points))
     unit = np.tile(np.repeat([1.0, 0.1 * float(np.median(poses[:, 2, 3]))], 3), len(poses))
     modes = _free_modes(poses)
     if with_focal:

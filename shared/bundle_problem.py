@@ -51,7 +51,7 @@ class Tracks:
 
 
 @dataclass(frozen=True)
-class State:
+class BundleState:
     """Unknowns: poses [F, 4, 4] (camera_from_points), points [N, 3], log of the focal length's gain."""
 
     poses: np.ndarray
@@ -120,7 +120,7 @@ class BundleProblem:
         """Slices over the points that bound the memory."""
         return (slice(i, i + CHUNK_POINTS) for i in range(0, len(self.anchor), CHUNK_POINTS))
 
-    def cost(self, state: State) -> float:
+    def cost(self, state: BundleState) -> float:
         """Cauchy cost of the residuals, the anchor's and the motion's."""
         total = 0.0
         for chunk in self.chunks():
@@ -143,7 +143,7 @@ class BundleProblem:
     def _focal(self, state) -> np.ndarray:
         return self.intrinsics[[0, 1], [0, 1]] * np.exp(state.log_focal)
 
-    def linearised(self, state: State, chunk: slice) -> Blocks:
+    def linearised(self, state: BundleState, chunk: slice) -> Blocks:
         """Normal equations of the points in one chunk."""
         residual, weight, turned, in_camera = self._residuals(state, chunk)
         x, y, z = in_camera
@@ -178,7 +178,7 @@ class BundleProblem:
             focal_points=np.einsum("baf,bfn->na", rotation, growing),
         )
 
-    def reduced_system(self, state: State) -> ReducedSystem:
+    def reduced_system(self, state: BundleState) -> ReducedSystem:
         """Gauss-Newton system of the cameras with the points eliminated (Schur complement)."""
         frames, count = self.seen.shape
         size = 6 * frames
@@ -212,7 +212,7 @@ class BundleProblem:
                 rhs[axis:size:6] += pull
         return ReducedSystem(matrix, rhs, coupling, half_inverse, point_rhs)
 
-    def step(self, state: State, system: ReducedSystem, damping: float) -> State:
+    def step(self, state: BundleState, system: ReducedSystem, damping: float) -> BundleState:
         """Solves the damped camera system, then each point for itself."""
         matrix = system.matrix + damping * np.diag(np.diag(system.matrix) + 1e-12)
         cameras = cho_solve(cho_factor(matrix, check_finite=False), system.rhs, check_finite=False)
@@ -221,7 +221,7 @@ class BundleProblem:
         own = np.einsum("njk,nj->nk", half, system.point_rhs)
         points = state.points + np.einsum("njk,nk->nj", half, own - coupled)
         poses = moved(state.poses, cameras[: 6 * frames].reshape(frames, 6))
-        return State(poses, points, state.log_focal + (float(cameras[-1]) if self.refine_focal else 0.0))
+        return BundleState(poses, points, state.log_focal + (float(cameras[-1]) if self.refine_focal else 0.0))
 
 
 def moved(poses: np.ndarray, motion: np.ndarray) -> np.ndarray:

@@ -56,7 +56,7 @@ class ChartFit:
 
 
 @dataclass(frozen=True)
-class ChartSight:
+class ChartObservation:
     """A chart in one frame. corners [4, 2] px of the pictures; values [24, 3]: the patches' linear values; weight
     [24, 3]: their inverse variance relative to a white diffuser's value squared, 0 where they say nothing; white [3]:
     irradiance over pi in the middle; log_sigma [3]: of the patches' word on that; frame: of the poses, the one that
@@ -71,7 +71,7 @@ class ChartSight:
     frame_index: int
 
     @classmethod
-    def from_record(cls, record: dict, crop: tuple[float, float, float], frame_index: np.ndarray) -> ChartSight:
+    def from_record(cls, record: dict, crop: tuple[float, float, float], frame_index: np.ndarray) -> ChartObservation:
         """From chart_watch.ChartWatch.record; crop: (x0, y0, scale) of the pictures; frame_index [F] of the poses."""
         clipped, trust = np.array(record["clipped"], bool), np.array(record["trust"])[:, None]
         return cls(
@@ -155,6 +155,7 @@ def _fit_channel(values: np.ndarray, reference: np.ndarray, spread: np.ndarray, 
         robust = 1.0 / (1.0 + (error / 2.5) ** 2)
         white = max(float(solved[0]), 1e-6)
     freedom = max(used.sum() - len(prior), 1)
-    excess = max(1.0, float((used * robust * error**2).sum()) / freedom)
+    variance_inflation = max(1.0, float((used * robust * error**2).sum()) / freedom)
     residual = (values - design @ solved) / (white * (np.abs(reference) + 0.02))
-    return float(solved[0]), float(np.sqrt(inverse[0, 0] * excess)) / white, float(solved[1]), robust, residual
+    deviation = float(np.sqrt(inverse[0, 0] * variance_inflation))
+    return float(solved[0]), deviation / white, float(solved[1]), robust, residual

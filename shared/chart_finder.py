@@ -33,7 +33,7 @@ LEAST_REGISTRATION = 0.6
 
 
 @dataclass(frozen=True)
-class ChartView:
+class ChartDetection:
     """A chart in one picture. corners [4, 2] px (see chart.CORNERS; first pixel's centre at 0.5); patches [24, 3] mean
     linear values; clipped [24, 3] bool; pitch_px: shortest edge of a grid cell."""
 
@@ -64,7 +64,7 @@ def find_chart(rgb: np.ndarray) -> np.ndarray | None:
     return (np.asarray(found.getBox(), float) + 0.5) / scale
 
 
-def read_chart(linear: np.ndarray, limit: float, corners: np.ndarray) -> ChartView | None:
+def read_chart(linear: np.ndarray, limit: float, corners: np.ndarray) -> ChartDetection | None:
     """The chart near rough corners [4, 2] px, drawn onto the picture and read; None where none can be registered there.
 
     linear [H, W, 3] float32; limit: linear value from which a channel counts as clipped.
@@ -89,7 +89,7 @@ def homography(corners: np.ndarray) -> np.ndarray:
     return cv2.getPerspectiveTransform(CORNERS.astype(np.float32), np.asarray(corners, np.float32))
 
 
-def _measure(linear: np.ndarray, limit: float, corners: np.ndarray) -> ChartView | None:
+def _measure(linear: np.ndarray, limit: float, corners: np.ndarray) -> ChartDetection | None:
     """Reads the patches; None where the grid leaves the picture, or is too small or too oblique to hold pixels."""
     height, width = linear.shape[:2]
     if not _convex(corners) or (corners < 0).any() or (corners > (width, height)).any():
@@ -108,7 +108,7 @@ def _measure(linear: np.ndarray, limit: float, corners: np.ndarray) -> ChartView
     mean, over = (np.stack([np.bincount(patch, part[:, c], PATCHES) for c in range(3)], 1) / count[:, None]
                   for part in (values, (values >= limit).astype(float)))
     edges = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1) / (COLUMNS, ROWS, COLUMNS, ROWS)
-    return ChartView(corners, mean, over > 0.02, float(edges.min()))
+    return ChartDetection(corners, mean, over > 0.02, float(edges.min()))
 
 
 def _convex(corners: np.ndarray) -> bool:
@@ -118,7 +118,7 @@ def _convex(corners: np.ndarray) -> bool:
     return bool((edge[:, 0] * following[:, 1] - edge[:, 1] * following[:, 0] > 0).all())
 
 
-def _register(linear: np.ndarray, view: ChartView, gap: float) -> tuple[float, np.ndarray | None]:
+def _register(linear: np.ndarray, view: ChartDetection, gap: float) -> tuple[float, np.ndarray | None]:
     """The painted template's best place: correlation there and corners [4, 2] px; (0, None) where it finds no hold."""
     cell = int(np.clip(round(view.pitch_px), *TEMPLATE_CELL_PX))
     low = np.maximum(np.floor(view.corners.min(0) - view.pitch_px), 0).astype(int)
@@ -146,7 +146,7 @@ def _tone(linear: np.ndarray) -> np.ndarray:
     return np.sqrt(np.clip(linear, 0.0, None)).mean(-1).astype(np.float32)
 
 
-def _template(view: ChartView, cell: int, gap: float) -> np.ndarray:
+def _template(view: ChartDetection, cell: int, gap: float) -> np.ndarray:
     """float32 [4 cell, 6 cell]: the grid as the patches read say, with gaps as dark as the darkest, antialiased."""
     fine = 8
     colours = _tone(view.patches).reshape(ROWS, COLUMNS)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from shared.chart import COLUMNS, CORNERS, ROWS, ChartFit, reflectances
-from shared.chart_finder import ChartView, homography
+from shared.chart_finder import ChartDetection, homography
 from shared.color import encode_srgb
 
 PICTURE_PX = 640
@@ -15,7 +15,7 @@ MARGIN = 0.25
 """What is shown around the chart, as a share of its longer side."""
 
 
-def draw_chart(rgb: np.ndarray, view: ChartView, fit: ChartFit, fault: str) -> np.ndarray:
+def draw_chart(rgb: np.ndarray, view: ChartDetection, fit: ChartFit, fault: str) -> np.ndarray:
     """uint8 sRGB [H, W, 3] around the chart of a frame: grid green where it is used, red where it is not; a square in
     each patch shows its stated reflectance under the light that was read."""
     reach = MARGIN * float(np.ptp(view.corners, axis=0).max())

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from shared.chart import ChartFit, fit_chart
-from shared.chart_finder import LEAST_LIKENESS, SMALLEST_PITCH_PX, ChartView, clipping_limit, find_chart, read_chart
+from shared.chart_finder import (
+    LEAST_LIKENESS,
+    SMALLEST_PITCH_PX,
+    ChartDetection,
+    clipping_limit,
+    find_chart,
+    read_chart,
+)
 from shared.chart_picture import draw_chart
 from shared.contract.chart_place import ChartPlace
 from shared.crop_pixels import decode_table, display_codes
@@ -26,7 +33,7 @@ class ChartWatch:
         self._place, self._transfer = place, transfer
         self._wanted: set[int] = set()
         self._last: np.ndarray | None = None
-        self._views: list[tuple[int, ChartView, ChartFit]] = []
+        self._views: list[tuple[int, ChartDetection, ChartFit]] = []
         self.picture: np.ndarray | None = None
 
     def expect(self, count: int) -> None:
@@ -59,7 +66,7 @@ class ChartWatch:
             best = max(views, key=lambda view: view.likeness)
             self._keep(self._place.frame, best, display_codes(codes, self._transfer))
 
-    def _keep(self, frame_index: int, view: ChartView, rgb: np.ndarray) -> None:
+    def _keep(self, frame_index: int, view: ChartDetection, rgb: np.ndarray) -> None:
         fit = fit_chart(view.patches, view.clipped)
         fault = _fault(view, fit)
         if self.picture is None or not (fault or self._used):
@@ -67,13 +74,13 @@ class ChartWatch:
         self._views.append((frame_index, view, fit))
 
     @property
-    def _used(self) -> list[tuple[int, ChartView, ChartFit]]:
+    def _used(self) -> list[tuple[int, ChartDetection, ChartFit]]:
         return [(index, view, fit) for index, view, fit in self._views if not _fault(view, fit)]
 
     def record(self) -> list[dict]:
-        """The frames in which the chart can be used, as ChartSight.from_record reads them: frame_index; corners [4, 2]
-        source px; patches [24, 3] linear values, clipped [24, 3] (1 where one only says "at least"); white, log_sigma,
-        glare [3], trust [24] and misfit (neutral, coloured) of ChartFit; pitch_px."""
+        """The frames in which the chart can be used, as ChartObservation.from_record reads them: frame_index; corners
+        [4, 2] source px; patches [24, 3] linear values, clipped [24, 3] (1 where one only says "at least"); white,
+        log_sigma, glare [3], trust [24] and misfit (neutral, coloured) of ChartFit; pitch_px."""
         return [{
             "frame_index": int(index),
             "corners": np.round(view.corners, 2).tolist(),
@@ -100,14 +107,14 @@ class ChartWatch:
         return []
 
 
-def _fault(view: ChartView, fit: ChartFit) -> str:
+def _fault(view: ChartDetection, fit: ChartFit) -> str:
     if view.pitch_px < SMALLEST_PITCH_PX:
         return (f"its patches are only {view.pitch_px:.0f} px apart ({SMALLEST_PITCH_PX:.0f} or more are needed): "
                 "bring it nearer or turn it to the camera")
     return fit.fault
 
 
-def _read(codes: np.ndarray, corners: np.ndarray, transfer: str) -> ChartView | None:
+def _read(codes: np.ndarray, corners: np.ndarray, transfer: str) -> ChartDetection | None:
     """The chart near rough corners [4, 2] px of a frame, decoded around it only; None where there is none."""
     reach = 0.5 * float(np.ptp(corners, axis=0).max()) + 8
     low = np.maximum(np.floor(corners.min(0) - reach), 0).astype(int)
@@ -119,4 +126,4 @@ def _read(codes: np.ndarray, corners: np.ndarray, transfer: str) -> ChartView | 
     view = read_chart(table[part], clipping_limit(table), corners - low)
     if view is None or view.likeness < LEAST_LIKENESS:
         return None
-    return ChartView(view.corners + low, view.patches, view.clipped, view.pitch_px)
+    return ChartDetection(view.corners + low, view.patches, view.clipped, view.pitch_px)

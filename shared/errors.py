@@ -17,11 +17,11 @@ class LimnError(Exception):
 class InputError(LimnError):
     """The input is at fault, not the program (exit code 2).
 
-    what: the fault in a few words. where: stage, file, frame or key. got, expected: values. mend: what to do.
+    what: the fault in a few words. where: stage, file, frame or key. got, expected: values. hint: what to do.
     """
 
-    def __init__(self, what: str, *, where: str = "", got: object = "", expected: object = "", mend: str = ""):
-        self.what, self.where, self.got, self.expected, self.mend = what, where, got, expected, mend
+    def __init__(self, what: str, *, where: str = "", got: object = "", expected: object = "", hint: str = ""):
+        self.what, self.where, self.got, self.expected, self.hint = what, where, got, expected, hint
         super().__init__(self._line())
 
     def _line(self) -> str:
@@ -30,12 +30,12 @@ class InputError(LimnError):
             parts.append(f"got {_plain(self.got)}")
         if self.expected != "":
             parts.append(f"expected {_plain(self.expected)}")
-        if self.mend:
-            parts.append(self.mend)
+        if self.hint:
+            parts.append(self.hint)
         return _plain(" ".join("; ".join(parts).split()), 10_000)
 
     def __reduce__(self):
-        fields = {"where": self.where, "got": self.got, "expected": self.expected, "mend": self.mend}
+        fields = {"where": self.where, "got": self.got, "expected": self.expected, "hint": self.hint}
         return _rebuild_input_error, (self.what, fields)
 
 

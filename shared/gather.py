@@ -29,11 +29,11 @@ _REMAP_COLUMNS = 1024
 
 @dataclass(frozen=True)
 class Picture:
-    """A frame ready for sampling. levels: linear RGB [H, W, 3] and halved copies of it; limits: per level int8
+    """A frame ready for sampling. levels: linear RGB [H, W, 3] and halved copies of it; saturation: per level int8
     [H, W, 3], +1 where the channel is clipped, -1 where crushed; inside [H, W]: 0 at the mask's border to 1 within."""
 
     levels: tuple[np.ndarray, ...]
-    limits: np.ndarray
+    saturation: np.ndarray
     inside: np.ndarray
 
 
@@ -51,23 +51,23 @@ class View:
 
 @dataclass(frozen=True)
 class Samples:
-    """Colours [P, F, 3] of P points in F frames, weight [P, F] (0: not seen), limits int8 [P, F, 3] (+1: the truth is
-    at least the colour, -1: at most), towards_camera [P, F, 3] unit vectors in head space."""
+    """Colours [P, F, 3] of P points in F frames, weight [P, F] (0: not seen), saturation int8 [P, F, 3] (+1: the truth
+    is at least the colour, -1: at most), towards_camera [P, F, 3] unit vectors in head space."""
 
     colours: np.ndarray
     weight: np.ndarray
-    limits: np.ndarray
+    saturation: np.ndarray
     towards_camera: np.ndarray
 
     def frames(self, index: np.ndarray) -> Samples:
         """The samples of some frames."""
         return Samples(
-            self.colours[:, index], self.weight[:, index], self.limits[:, index], self.towards_camera[:, index]
+            self.colours[:, index], self.weight[:, index], self.saturation[:, index], self.towards_camera[:, index]
         )
 
     def points(self, index: np.ndarray) -> Samples:
         """The samples of some points."""
-        return Samples(self.colours[index], self.weight[index], self.limits[index], self.towards_camera[index])
+        return Samples(self.colours[index], self.weight[index], self.saturation[index], self.towards_camera[index])
 
 
 class SurfaceViewer:
@@ -150,14 +150,14 @@ class SurfaceViewer:
 def prepare_picture(codes: np.ndarray, linear: np.ndarray, mask: np.ndarray, border_px: float = 3.0) -> Picture:
     """codes [H, W, 3] uint8 or uint16, linear [H, W, 3] float32, mask [H, W] (0: background) -> Picture."""
     maximum = np.iinfo(codes.dtype).max
-    limits = (codes >= CLIPPED_CODE * maximum).astype(np.int8) - (codes <= CRUSHED_CODE * maximum).astype(np.int8)
+    saturation = (codes >= CLIPPED_CODE * maximum).astype(np.int8) - (codes <= CRUSHED_CODE * maximum).astype(np.int8)
     distance = cv2.distanceTransform((mask > 0).astype(np.uint8), cv2.DIST_L2, 3)
     inside = np.clip((distance - 1.0) / border_px, 0.0, 1.0)
     levels = [np.ascontiguousarray(linear, np.float32)]
     while min(levels[-1].shape[:2]) >= 64:
         height, width = levels[-1].shape[:2]
         levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
-    return Picture(tuple(levels), limits, inside.astype(np.float32))
+    return Picture(tuple(levels), saturation, inside.astype(np.float32))
 
 
 def remap(image: np.ndarray, pixels: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
@@ -193,18 +193,18 @@ def sample_colours(picture: Picture, pixels: np.ndarray, footprint: np.ndarray |
     return colours
 
 
-def satisfied(limits, error):
+def is_inactive(saturation, error):
     """Where a clipped or crushed sample, which only knows a bound, says nothing against the model.
 
-    limits as in Samples; error: model minus sample. Arrays or tensors of one shape -> bool of that shape.
+    saturation as in Samples; error: model minus sample. Arrays or tensors of one shape -> bool of that shape.
     """
-    return ((limits > 0) & (error >= 0)) | ((limits < 0) & (error <= 0))
+    return ((saturation > 0) & (error >= 0)) | ((saturation < 0) & (error <= 0))
 
 
-def sample_limits(limits: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """A picture's limits [H, W, 3] at pixels [N, 2] -> int8 [N, 3]: +1 or -1 where a pixel that the sample reads is
-    clipped or crushed. Limits as float32 need not be converted."""
-    found = remap(limits.astype(np.float32, copy=False), pixels, cv2.INTER_LINEAR)
+def sample_saturation(saturation: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """A picture's saturation bounds [H, W, 3] at pixels [N, 2] -> int8 [N, 3]: +1 or -1 where a pixel that the sample
+    reads is clipped or crushed. Bounds as float32 need not be converted."""
+    found = remap(saturation.astype(np.float32, copy=False), pixels, cv2.INTER_LINEAR)
     return (found > 0.1).astype(np.int8) - (found < -0.5).astype(np.int8)
 
 
@@ -213,7 +213,7 @@ def sample_inside(picture: Picture, pixels: np.ndarray) -> np.ndarray:
     return remap(picture.inside, pixels, cv2.INTER_LINEAR)
 
 
-def gather_samples(
+def sample_points_in_frames(
     viewer: SurfaceViewer, index: np.ndarray, pictures, camera_from_head: np.ndarray, intrinsics: np.ndarray
 ) -> Samples:
     """Samples of the vertices index [P] in F frames.
@@ -223,7 +223,7 @@ def gather_samples(
     """
     shape = (len(index), len(camera_from_head))
     intrinsics = np.broadcast_to(intrinsics, (len(camera_from_head), 3, 3))
-    colours, limits = np.zeros(shape + (3,), np.float32), np.zeros(shape + (3,), np.int8)
+    colours, saturation = np.zeros(shape + (3,), np.float32), np.zeros(shape + (3,), np.int8)
     weight, towards = np.zeros(shape, np.float32), np.zeros(shape + (3,), np.float32)
     viewer, index = viewer.limited_to(index)
     for f, picture in enumerate(pictures):
@@ -232,9 +232,9 @@ def gather_samples(
         seen = np.nonzero(view.weight[index] > 0)[0]
         pixels = view.pixels[index[seen]]
         colours[seen, f] = sample_colours(picture, pixels)
-        limits[seen, f] = sample_limits(picture.limits, pixels)
+        saturation[seen, f] = sample_saturation(picture.saturation, pixels)
         weight[seen, f] = view.weight[index[seen]] * sample_inside(picture, pixels)
-    return Samples(colours, weight, limits, towards)
+    return Samples(colours, weight, saturation, towards)
 
 
 def texel_size(mesh: Mesh, size: int) -> np.ndarray:

@@ -60,7 +60,7 @@ def places_around(points: Points, reach_mm: float) -> np.ndarray:
     return np.stack(near, axis=1)
 
 
-def shadow_doubt(
+def shadow_uncertainty(
     points: Points, transfer: Transfer, light: np.ndarray, directions: np.ndarray, reach_mm: float
 ) -> np.ndarray:
     """[P, N] standard deviation of the irradiance over pi of P points in lights [J, N] along directions [J, 3], given

@@ -190,7 +190,7 @@ def _load(path: Path) -> cv2.dnn.Net:
             where=str(path),
             got=str(error).strip().splitlines()[-1],
             expected="an undamaged .tflite file",
-            mend="run make setup",
+            hint="run make setup",
         ) from error
 
 

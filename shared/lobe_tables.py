@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from shared.compiled import compiled
-from shared.lobes import LobeTable, blocks_of, cover_lobe, weigh_directions
+from shared.lobes import SpecularTransfer, blocks_of, cover_lobe, weigh_directions
 from shared.threads import share_out
 
 _LOG_STEP = 0.05
@@ -21,7 +21,7 @@ _LOG_STEP = 0.05
 
 
 def specular_tables(
-    table: LobeTable, towards: np.ndarray, roughness: float | np.ndarray
+    table: SpecularTransfer, towards: np.ndarray, roughness: float | np.ndarray
 ) -> tuple[torch.Tensor, np.ndarray]:
     """The lobes of all points in F views: open weights bfloat16 [F, P, J] and blocked weight float32 [P, F].
 
@@ -37,13 +37,13 @@ def specular_tables(
     return _of_all_views(table, towards, tabulate if table.resolves(roughness) else None, split)
 
 
-def specular_slopes(table: LobeTable, towards: np.ndarray, roughness: float) -> tuple[torch.Tensor, np.ndarray]:
+def specular_slopes(table: SpecularTransfer, towards: np.ndarray, roughness: float) -> tuple[torch.Tensor, np.ndarray]:
     """Derivatives of specular_tables by the logarithm of the roughness, as central differences; shapes as there."""
     ends = [roughness * float(np.exp(side * _LOG_STEP)) for side in (-1.0, 1.0)]
 
     def tabulate(view: np.ndarray, bits: np.ndarray, blocked: np.ndarray) -> None:
-        alphas = (table.alpha2(end) for end in ends)
-        _tabulate_slopes(table.normals, view, *alphas, table.directions, table.visible, bits, blocked)
+        narrower, wider = (table.alpha2(end) for end in ends)
+        _tabulate_slopes(table.normals, view, narrower, wider, table.directions, table.visible, bits, blocked)
 
     def split(part: slice, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         narrower, wider = (table.split_sum(part, view, end) for end in ends)
@@ -53,7 +53,7 @@ def specular_slopes(table: LobeTable, towards: np.ndarray, roughness: float) -> 
 
 
 def _of_all_views(
-    table: LobeTable, towards: np.ndarray, tabulate: Callable | None, split: Callable
+    table: SpecularTransfer, towards: np.ndarray, tabulate: Callable | None, split: Callable
 ) -> tuple[torch.Tensor, np.ndarray]:
     """tabulate: fills one view's table where the directions resolve the lobes; split: weights of a part of the points
     on all directions and on the open ones, where they do not."""

@@ -24,7 +24,7 @@ from shared.split_sum import SplitSum, narrowest_roughness
 _POINTS_PER_BLOCK = 512
 
 
-class LobeTable:
+class SpecularTransfer:
     """What the lobes of P points share over all views: cosines with J directions and visibility.
 
     normals [P, 3], visible [P, J] bool (as Transfer.visibility), directions [J, 3] uniform over the sphere.
@@ -37,13 +37,13 @@ class LobeTable:
         self.narrowest = narrowest_roughness(len(directions))
         self._split_sum: SplitSum | None = None
 
-    def take(self, index: np.ndarray) -> LobeTable:
+    def take(self, index: np.ndarray) -> SpecularTransfer:
         """The table of the points at index."""
         part = copy(self)
         part.normals, part.visible = self.normals[index], self.visible[index]
         return part
 
-    def turned(self, normals: np.ndarray) -> LobeTable:
+    def turned(self, normals: np.ndarray) -> SpecularTransfer:
         """The same points with other normals [P, 3]; what they see stays."""
         other = copy(self)
         other.normals = np.ascontiguousarray(normals, np.float32)
@@ -68,7 +68,7 @@ class LobeTable:
 
 
 def specular_reflection(
-    table: LobeTable,
+    table: SpecularTransfer,
     towards: np.ndarray,
     roughness: float | np.ndarray,
     light: np.ndarray,
@@ -84,8 +84,9 @@ def specular_reflection(
     result, blocked = np.zeros((len(table), light.shape[1]), np.float32), np.zeros(len(table), np.float32)
     if table.resolves(roughness):
         channels = np.ascontiguousarray(light.T)
-        where = table.normals, towards, table.alpha2(roughness), table.directions, table.visible
-        _sum_lobes(*where, channels, result, blocked)
+        _sum_lobes(
+            table.normals, towards, table.alpha2(roughness), table.directions, table.visible, channels, result, blocked
+        )
     else:
         for part in blocks_of(table):
             every, seen = table.split_sum(part, towards[part], roughness)
@@ -93,7 +94,7 @@ def specular_reflection(
     return result if blocked_light is None else result + blocked[:, None] * blocked_light
 
 
-def blocks_of(table: LobeTable) -> list[slice]:
+def blocks_of(table: SpecularTransfer) -> list[slice]:
     """Parts of the points whose weights fit into memory."""
     return [slice(start, start + _POINTS_PER_BLOCK) for start in range(0, len(table), _POINTS_PER_BLOCK)]
 

@@ -43,15 +43,18 @@ def render_frame(
     width, height = size
     mesh = viewer.mesh
     shade = np.concatenate([shading.irradiance(frame), shading.reflection(frame)], axis=1)
-    surface = mesh.faces, mesh.face_uvs, mesh.uvs.astype(np.float32)
-    textures = (np.ascontiguousarray(texture, np.float32) for texture in (maps.albedo, maps.specular_intensity))
-    surface = *surface, *textures, np.ascontiguousarray(shade, np.float32)
+    shade, uvs = np.ascontiguousarray(shade, np.float32), mesh.uvs.astype(np.float32)
+    albedo = np.ascontiguousarray(maps.albedo, np.float32)
+    intensity = np.ascontiguousarray(maps.specular_intensity, np.float32)
     radiance, hits = np.zeros((height * width, 3), np.float32), np.zeros(height * width, np.float32)
     for row in range(samples):
         for column in range(samples):
             offsets = (column + 0.5) / samples, (row + 0.5) / samples
             face, bary, _ = camera_hits(viewer.scene, camera_from_head, intrinsics, width, height, offsets)
-            _add_radiance(face.ravel(), bary.reshape(-1, 3), *surface, radiance, hits)
+            _add_radiance(
+                face.ravel(), bary.reshape(-1, 3), mesh.faces, mesh.face_uvs, uvs, albedo, intensity, shade, radiance,
+                hits
+            )
     radiance /= np.maximum(hits, 1.0)[:, None]
     return radiance.reshape(height, width, 3), (hits / samples**2).reshape(height, width)
 

@@ -20,8 +20,8 @@ from scipy.spatial import cKDTree
 from shared.brdf import hemispherical_albedo
 from shared.envmap import frame_lookup
 from shared.geometry import camera_centres, vector_from_rotation, world_from_head
-from shared.irradiance_errors import SHADOW_MM, irradiance_slope, shadow_doubt
-from shared.lobes import LobeTable, specular_reflection
+from shared.irradiance_errors import SHADOW_MM, irradiance_slope, shadow_uncertainty
+from shared.lobes import SpecularTransfer, specular_reflection
 from shared.mesh import normalised
 from shared.transfer import Points, Transfer, bounced_irradiance, irradiance, node_radiosity
 
@@ -81,7 +81,7 @@ class VertexShading:
     ):
         self.material, self.directions = material, directions
         self.points, self.transfer = points, transfer
-        self.table = LobeTable(points.normals, transfer.visibility(), directions)
+        self.table = SpecularTransfer(points.normals, transfer.visibility(), directions)
         self.stand_in = _stand_ins(vertices, index, transfer.blocked, deep)
         self._node_direct = node_transfer.direct.astype(np.float32)
         self._radiosity = node_radiosity(node_transfer, material.bounce_albedo()).astype(np.float32) if bounce else None
@@ -109,7 +109,7 @@ class VertexShading:
             self._turn += 2.0 * np.pi * light_index
         self._keys = key_frames(self._turn, self._key_step)
         self._key_reflection: dict[int, np.ndarray] = {}
-        self._key_doubt: np.ndarray | None = None
+        self._key_uncertainty: np.ndarray | None = None
 
     def _sent_by_nodes(self) -> np.ndarray:
         """[K, F * 3]: the nodes' radiosity over pi, with all diffuse bounces."""
@@ -137,13 +137,13 @@ class VertexShading:
         """
         return self._between_keys(frame, self._at_key)
 
-    def shadow_doubt(self, frame: int) -> np.ndarray:
+    def shadow_uncertainty(self, frame: int) -> np.ndarray:
         """[V, 3] float32: standard deviation of E, given how far off the borders of shadows may be."""
-        if self._key_doubt is None:
+        if self._key_uncertainty is None:
             light = self.light_along[:, self._keys].reshape(len(self.directions), -1)
-            doubt = shadow_doubt(self.points, self.transfer, light, self.directions, SHADOW_MM)
-            self._key_doubt = doubt.reshape(len(self.points), len(self._keys), 3).astype(np.float16)
-        return self._between_keys(frame, lambda key: self._key_doubt[:, np.searchsorted(self._keys, key)])
+            uncertainty = shadow_uncertainty(self.points, self.transfer, light, self.directions, SHADOW_MM)
+            self._key_uncertainty = uncertainty.reshape(len(self.points), len(self._keys), 3).astype(np.float16)
+        return self._between_keys(frame, lambda key: self._key_uncertainty[:, np.searchsorted(self._keys, key)])
 
     def _between_keys(self, frame: int, at_key: Callable[[int], np.ndarray]) -> np.ndarray:
         """[V, 3] float32 of what at_key says [P, 3] of the two key frames around a frame."""

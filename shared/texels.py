@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse.linalg import splu
 
 from shared.compiled import compiled
-from shared.gather import Picture, View, sample_colours, sample_inside, sample_limits, texel_size
+from shared.gather import Picture, View, sample_colours, sample_inside, sample_saturation, texel_size
 from shared.mesh import Mesh, rasterize_uv, vertex_adjacency
 
 _BLOCK = 1 << 16
@@ -19,23 +19,25 @@ _BLOCK = 1 << 16
 
 @dataclass(frozen=True)
 class TexelSamples:
-    """One frame at the texels rows [n] (indices into TexelSurface): colours [n, 3], weight [n], limits int8 [n, 3]."""
+    """One frame at the texels rows [n] (indices into TexelSurface): colours [n, 3], weight [n], saturation int8 [n,
+    3]."""
 
     rows: np.ndarray
     colours: np.ndarray
     weight: np.ndarray
-    limits: np.ndarray
+    saturation: np.ndarray
 
 
 @dataclass(frozen=True)
 class FrameView:
     """A frame before it is sampled: rows [n] of the texels that it shows, table [V, 4 + C] of what is linear on the
-    surface (pixel times depth, depth, weight, C values of the caller's), the picture and its limits as float32."""
+    surface (pixel times depth, depth, weight, C values of the caller's), the picture and its saturation bounds as
+    float32."""
 
     rows: np.ndarray
     table: np.ndarray
     picture: Picture
-    limits: np.ndarray
+    saturation: np.ndarray
     focal_length: np.float32
 
     def blocks(self) -> list[np.ndarray]:
@@ -102,8 +104,8 @@ class TexelSurface:
         depth = view.depth[:, None]
         columns = [view.pixels * depth, depth, view.weight[:, None]] + ([] if values is None else [values])
         table = np.concatenate(columns, axis=1, dtype=np.float32, casting="same_kind")
-        rows, limits = np.nonzero(seen_face[self.face])[0], picture.limits.astype(np.float32)
-        return FrameView(rows, table, picture, limits, np.float32(intrinsics[0, 0]))
+        rows, saturation = np.nonzero(seen_face[self.face])[0], picture.saturation.astype(np.float32)
+        return FrameView(rows, table, picture, saturation, np.float32(intrinsics[0, 0]))
 
     def samples(self, frame: FrameView, rows: np.ndarray | None = None) -> tuple[TexelSamples, np.ndarray]:
         """What the frame shows of some of its rows [n], None: of all -> samples, and its values at them [n, C]."""
@@ -113,7 +115,7 @@ class TexelSurface:
         _project(found, self._texel_mm, rows, frame.focal_length, pixels, footprint)
         weight = found[:, 3] * sample_inside(frame.picture, pixels)
         colours = sample_colours(frame.picture, pixels, footprint)
-        return TexelSamples(rows, colours, weight, sample_limits(frame.limits, pixels)), found[:, 4:]
+        return TexelSamples(rows, colours, weight, sample_saturation(frame.saturation, pixels)), found[:, 4:]
 
     def to_vertices(self, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Weighted means of texel values [T, C] around each vertex; weight [T, C] -> means and total weights [V, C]."""

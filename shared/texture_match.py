@@ -28,7 +28,7 @@ LIKENESS, WINDOW_TEXELS = 0.6, 3.0
 
 
 @dataclass(frozen=True)
-class MeanTexture:
+class ClipTexture:
     """mean radiance [S, S, 3] linear of a clip on its mesh, weight [S, S]: of the samples, in frames seen head-on."""
 
     mesh: Mesh
@@ -67,7 +67,7 @@ class Matches:
         return Matches(self.first[::step], self.second[::step], self.normals[::step])
 
 
-def match_textures(first: MeanTexture, second: MeanTexture) -> Matches:
+def match_textures(first: ClipTexture, second: ClipTexture) -> Matches:
     """Texels of two maps of one size that show the same skin."""
     dense = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     one, two = first.contrast(), second.contrast()

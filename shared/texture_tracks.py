@@ -32,7 +32,7 @@ LEAST_SPREAD = 1.0
 
 
 @dataclass(frozen=True)
-class MeanTexture:
+class MeanContrast:
     """mean [h, w] of the frames' contrast pictures, spread [h, w] about it, seen [h, w]: how many frames count."""
 
     mean: np.ndarray
@@ -40,7 +40,7 @@ class MeanTexture:
     seen: np.ndarray
 
 
-def mean_texture(frames: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]) -> MeanTexture:
+def mean_texture(frames: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]) -> MeanContrast:
     """Mean over (picture [h, w] float32, weight [h, w]) pairs, then once more with outliers weighed down.
 
     frames() iterates over the pairs anew each time it is called.
@@ -48,7 +48,7 @@ def mean_texture(frames: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]) 
     mean, spread, _ = _moments(frames(), lambda image, weight: weight)
     scale = OUTLIER_SPREADS * spread
     mean, spread, seen = _moments(frames(), lambda image, weight: weight / (1.0 + ((image - mean) / scale) ** 2))
-    return MeanTexture(mean.astype(np.float32), spread.astype(np.float32), seen.astype(np.float32))
+    return MeanContrast(mean.astype(np.float32), spread.astype(np.float32), seen.astype(np.float32))
 
 
 def _moments(pairs, reweigh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -71,7 +71,7 @@ class Windows:
 
 
 def track_frame(
-    atlas: Atlas, texture: MeanTexture, picture: np.ndarray, placed: PlacedFrame, windows: Windows
+    atlas: Atlas, texture: MeanContrast, picture: np.ndarray, placed: PlacedFrame, windows: Windows
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where one frame's contrast picture [H, W] shows the tracked texels.
 

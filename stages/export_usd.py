@@ -102,15 +102,16 @@ def write_images(job: Job, writer, maps: dict, envmap, frames, render_frames: li
 
 def describe_capture(job: Job, poses: dict, frames):
     """Lens, film back and motion of the clip."""
-    from shared.io.usd_capture import DEFAULT_FILM_WIDTH_MM, Capture
+    from shared.io.usd_capture import DEFAULT_FILM_WIDTH_MM, UsdCapture
 
     width, height = frames.source_size
     intrinsics, film_width = poses["intrinsics"], job.subject.sensor_width_mm or DEFAULT_FILM_WIDTH_MM
     if job.subject.sensor_width_mm is not None and job.subject.focal_length_mm is not None:
         film_width = job.subject.focal_length_mm * width / float(intrinsics[0, 0])  # right for turned clips too
-    return Capture(poses["camera_from_head"], poses["frame_index"], fps=frames.fps, intrinsics=intrinsics, width=width,
-                   height=height, moves=frames.moves, film_width_mm=film_width,
-                   light_with_camera=light_moves(job, frames.moves) != frames.moves)
+    return UsdCapture(poses["camera_from_head"], poses["frame_index"], fps=frames.fps, intrinsics=intrinsics,
+                      width=width,
+                      height=height, moves=frames.moves, film_width_mm=film_width,
+                      light_with_camera=light_moves(job, frames.moves) != frames.moves)
 
 
 def describe_asset(job: Job, mesh, capture, frames, writer):
@@ -118,14 +119,14 @@ def describe_asset(job: Job, mesh, capture, frames, writer):
     from shared.io.plates import crop_rectangle, write_plates
     from shared.io.usd import HeadAsset
     from shared.io.usd_capture import Plate
-    from shared.io.usd_material import SHADER_INPUTS, Texture
+    from shared.io.usd_material import SHADER_INPUTS, TextureFile
 
     plate = None
     if job.params.plates:
         shown = write_plates(job.out / "plates", frames, capture.frame_index, job.progress)
         plate = Plate({frame: f"./plates/{name}" for frame, name in shown.items()}, crop_rectangle(frames))
     spaces = {"diffuse_albedo": writer.colour_space}
-    maps = {name: Texture(f"./maps/{writer.file_name(name)}", spaces.get(name, "data")) for name in SHADER_INPUTS}
+    maps = {name: TextureFile(f"./maps/{writer.file_name(name)}", spaces.get(name, "data")) for name in SHADER_INPUTS}
     metadata = {
         "clip": {"name": frames.source_name, "width": capture.width, "height": capture.height, "fps": frames.fps},
         "moves": frames.moves,
@@ -134,7 +135,7 @@ def describe_asset(job: Job, mesh, capture, frames, writer):
         "brdf": "albedo / pi + specular_intensity * GGX (Smith, Schlick F0 = 0.04, alpha = roughness^2)",
         "confidence_map": f"maps/{writer.file_name('confidence')}",
     }
-    light = Texture("./envmap.exr", writer.colour_space)
+    light = TextureFile("./envmap.exr", writer.colour_space)
     return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, version=str(STAGE.version), metadata=metadata)
 
 
@@ -169,8 +170,10 @@ def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, frames
     if not job.params.views:
         return None
     cameras, moves = held_out_cameras(poses, frames.intrinsics, frames.size, solve), light_moves(job, frames.moves)
-    clip = envmap, poses["camera_from_head"], moves
-    views = make_views(mesh, maps, *clip, job.params.view_size, cameras, job.progress)
+    views = make_views(
+        mesh, maps, envmap, camera_from_head=poses["camera_from_head"], moves=moves, pixels=job.params.view_size,
+        held_out=cameras, progress=job.progress,
+    )
     (job.out / "views").mkdir()
     pictures = {f"novel_{name}": picture for name, picture in views.novel.items()}
     pictures |= {f"relit_{name}": picture for name, picture in views.relit.items()}
@@ -210,7 +213,7 @@ def write_lights(job: Job, writer, envmap, clips: list) -> None:
 def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     """The content of run.json: what each stage was told, what it took, what it found."""
     from shared.mesh_checks import mesh_warnings
-    from shared.report.gather import ladder_record, own_record, stage_record, warnings_of
+    from shared.report.gather import own_record, selection_record, stage_record, warnings_of
 
     records, warnings = {}, []
     for name in job.input_names:
@@ -225,8 +228,8 @@ def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     records[STAGE.name] = own
     kept = ("model", "residuals", "albedo_scale", "held_out_frames", "clips")
     chosen = {key: solve[key] for key in kept if key in solve}
-    if ladder := ladder_record(job.input("inverse_render"), solve):
-        chosen["ladder"] = ladder
+    if selection := selection_record(job.input("inverse_render"), solve):
+        chosen["ladder"] = selection
     return {
         "subject": job.subject.name,
         "stages": records,
@@ -262,7 +265,7 @@ def run(job: Job) -> None:
     from shared.io.images import read_exr
     from shared.io.meshes import load_mesh
     from shared.processor import use_baseline_opencv
-    from shared.report.build import Result, result_report
+    from shared.report.build import ReportInputs, result_report
     from shared.report.methods import methods_paragraphs, methods_text
 
     use_baseline_opencv()
@@ -285,8 +288,9 @@ def run(job: Job) -> None:
     (job.out / "methods.txt").write_text(methods_text(methods), encoding="utf-8")
     folders = {name: job.input(name) for name in STAGE.inputs}
     files = [(output.path, output.help) for output in STAGE.outputs]
-    result = Result(job.subject.name, folders, frames, mesh, poses, maps, envmap, solve, record, files, views, clips,
-                    methods_paragraphs(methods))
+    result = ReportInputs(job.subject.name, folders, frames, mesh, poses, maps, envmap, solve, record, files, views,
+                          clips,
+                          methods_paragraphs(methods))
     page = result_report(result, job.params.report_frames)
     (job.out / "report.html").write_text(page, encoding="utf-8")
 

@@ -30,7 +30,7 @@ from shared.errors import InputError, LimnError
 
 SOLVERS = ("transfer", "reference")
 MODELS = ("full", "auto")
-LADDER_SECONDS = "ladder_seconds.json"
+SELECTION_SECONDS = "ladder_seconds.json"
 LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 STAGE = Stage(
@@ -54,7 +54,7 @@ STAGE = Stage(
         Output("clips/*/renders/*.exr", "re-renders of another clip", space="crop", colour_space="lin_rec709_scene",
                optional=True),
         Output("solve.json", "model, residuals, steps, scale of the albedo, held-out frames, warnings", fields=SOLVE),
-        Output(LADDER_SECONDS, "what each rung of solve.json's ladder took (model=auto)", unit="s",
+        Output(SELECTION_SECONDS, "what each candidate of solve.json's model selection took (model=auto)", unit="s",
                volatile=True, optional=True, fields=LADDER_TIMES),
     ),
     parameters=(
@@ -65,8 +65,8 @@ STAGE = Stage(
                   "harmonics of its logarithm, one sun and a sky, or a lamp at the camera.", choices=LIGHT_MODELS),
         Parameter("model", str, "full", "Solve the full model that the other parameters describe, or climb towards it "
                   "only as far as held-out frames fit better for it.", choices=MODELS),
-        Parameter("forced", str, "", "Parts of the model that model=auto leaves as the other parameters say, separated "
-                  "by commas: visibility, specular, light, geometry, roughness."),
+        Parameter("fixed_parts", str, "", "Parts of the model that model=auto leaves as the other parameters say, "
+                  "separated by commas: visibility, specular, light, geometry, roughness.", former="forced"),
         Parameter("points", int, 4000, "Surface points that the light is solved from.", "", 200, 40000),
         Parameter("directions", int, 768, "Directions over the sphere.", "", 128, 8192),
         Parameter("bounce_nodes", int, 1000, "Surface nodes that exchange bounced light.", "", 50, 6000),
@@ -81,13 +81,15 @@ STAGE = Stage(
         Parameter("local_roughness", bool, True, "Let roughness vary over the skin where held-out frames gain by it."),
         Parameter("specular_prior", float, 0.7, "Expected specular intensity of skin; index of refraction 1.4: 0.7.",
                   "", 0.01, 2.0),
-        Parameter("white_light", float, 0.15, "Expected deviation of the light's log colour ratios from grey.", "",
-                  0.01, 2.0),
-        Parameter("skin_brightness", float, 0.2, "Expected deviation of the log albedo's brightness at large scale "
-                  "over the skin of a face.", "", 0.01, 10.0),
-        Parameter("skin_colour", float, 0.1, "The same of its colour, per channel about their mean.", "", 0.01, 10.0),
+        Parameter("light_colour_sigma", float, 0.15, "Expected deviation of the light's log colour ratios from grey.",
+                  "", 0.01, 2.0, former="white_light"),
+        Parameter("skin_brightness_sigma", float, 0.2, "Expected deviation of the log albedo's brightness at large "
+                  "scale over the skin of a face.", "", 0.01, 10.0, former="skin_brightness"),
+        Parameter("skin_colour_sigma", float, 0.1, "The same of its colour, per channel about their mean.", "",
+                  0.01, 10.0, former="skin_colour"),
         Parameter("light_smoothness", float, 1.0, "Weight of the light's smoothness.", "", 0.0, 1000.0),
-        Parameter("evidence", float, 5000.0, "How many independent samples the clip counts as.", "", 10.0, 1e7),
+        Parameter("independent_samples", float, 5000.0, "How many independent samples the clip counts as.", "", 10.0,
+                  1e7, former="evidence"),
         Parameter("chart", bool, True, "Take the light's scale from the colour chart that sample_frames found."),
         Parameter("shape", bool, True, "Refine the mesh from shading, parallax and tracks."),
         Parameter("silhouette", bool, True, "Before the solve, move ears, skull and jaw so that the outline meets the "
@@ -97,8 +99,8 @@ STAGE = Stage(
         Parameter("shape_frames", int, 48, "Frames that the shape is solved from, spread evenly.", "frames", 3, 1000),
         Parameter("shape_smoothness", float, 19.0, "Lambda of the large steps: over how many edges, squared, the "
                   "surface moves together.", "", 0.0, 10000.0),
-        Parameter("shape_spread", float, 8.0, "Expected distance of the tracked mesh from the truth where it is wrong "
-                  "as a whole.", "mm", 0.01, 100.0),
+        Parameter("shape_sigma", float, 8.0, "Expected distance of the tracked mesh from the truth where it is wrong "
+                  "as a whole.", "mm", 0.01, 100.0, former="shape_spread"),
         Parameter("normal_map", bool, True, "Solve relief finer than the mesh as a normal map; else it is flat."),
         Parameter("render_count", int, 8, "Frames to re-render, spread evenly.", "frames", 1, 2000),
         Parameter("mesh", str, "", "Mesh (.npz or .obj) to use instead of the tracked one; empty: tracked.",
@@ -192,7 +194,7 @@ def read_clips(job: Job) -> tuple:
              "solver": params.solver == "reference"}
     for name in (name for name, is_given in given.items() if is_given and job.clips):
         raise InputError("works on one clip only", where=f"--set inverse_render.{name}", got=f"{len(job.clips)} clips",
-                         mend="leave it out, or make a subject of one clip")
+                         hint="leave it out, or make a subject of one clip")
     folders = [(job.input("sample_frames", clip), job.input("track_landmarks", clip)) for clip in job.clips or ("",)]
     return tuple(read_inputs(*pair, params.mesh, params.poses) for pair in folders)
 
@@ -203,11 +205,11 @@ def write_shape(job: Job, inputs, mesh) -> None:
     from shared.io.meshes import save_mesh
     from shared.shape_pictures import shape_sheet
     from shared.solve.inverse_problem import FACE_SKIN
-    from shared.solve.reshape import Reshaped, faces_of, segments_of, subdivided_to
+    from shared.solve.reshape import RefinedInputs, faces_of, segments_of, subdivided_to
 
     segment = segments_of(inputs, mesh)
     save_mesh(job.out / "mesh.npz", mesh, **({} if segment is None else {"face_segment": segment}))
-    face = None if segment is None else faces_of(Reshaped(inputs, mesh), FACE_SKIN)
+    face = None if segment is None else faces_of(RefinedInputs(inputs, mesh), FACE_SKIN)
     write_png(job.out / "shape.png", shape_sheet(subdivided_to(inputs.mesh, mesh), mesh, face))
 
 
@@ -231,9 +233,9 @@ def run(job: Job) -> None:
         inputs = join_clips(clips, textures)
         placed = [{"name": name, **facts} for name, facts in zip(job.clips, inputs.describe(), strict=True)]
         job.note(f"clips in one head space: {placed}")
-    sights = inputs.chart_sights() if job.params.chart else ()
+    observations = inputs.chart_observations() if job.params.chart else ()
     settings = read_settings(job.params, job.out.parent / CHECKPOINT)
-    result = solve_clip(inputs, settings, job.progress, job.note, sights)
+    result = solve_clip(inputs, settings, job.progress, job.note, observations)
     record = summarise(inputs, result)
     record["warnings"] += [f"clip {clip['name']} lies {clip['match_px']:.1f} px beside the shared mesh: other lens, "
                            "another expression?" for clip in placed if clip.get("match_px", 0.0) > FAR_PX]
@@ -248,8 +250,8 @@ def run(job: Job) -> None:
     record |= own[0]
     if job.clips:
         record["clips"] = [clip | frames for clip, frames in zip(placed, own, strict=True)]
-    if rungs := record.get("ladder"):
-        write_json(job.out / LADDER_SECONDS, [rung.pop("seconds") for rung in rungs])
+    if candidates := record.get("ladder"):
+        write_json(job.out / SELECTION_SECONDS, [candidate.pop("seconds") for candidate in candidates])
     write_json(job.out / "solve.json", record)
 
 
@@ -265,7 +267,7 @@ def check(job: Job) -> None:
             raise LimnError(f"{name} leaves [0, {highest:g}]: {image.min():.3f} .. {image.max():.3f}")
     if not (maps["confidence"] > 0.5).mean() > 0.01:
         raise InputError("the clip determines less than a hundredth of the map", where=str(job.subject.folder),
-                         mend="film with more light, sharper, or with a wider turn")
+                         hint="film with more light, sharper, or with a wider turn")
     record = read_json(job.out / "solve.json")
     others = {job.out / "clips" / clip["name"]: clip for clip in record.get("clips", ())[1:]}
     for folder, clip in ({job.out: record} | others).items():

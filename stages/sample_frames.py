@@ -41,8 +41,8 @@ STAGE = Stage(
         Parameter("max_size", int, 1024, "Longest side of the crop; larger ones are scaled down.", "px", 128, 4096),
         Parameter("candidates", int, 4, "Frames to look at for each that is kept, where the clip has so many.", "",
                   1, 100),
-        Parameter("blurred_below", float, 0.4, "Frames less sharp than this share of their neighbours are dropped.",
-                  "", 0.0, 1.0),
+        Parameter("min_sharpness", float, 0.4, "Frames less sharp than this share of their neighbours are dropped.",
+                  "", 0.0, 1.0, former="blurred_below"),
     ),
 )
 
@@ -68,7 +68,7 @@ def run(job: Job) -> None:
     candidates = params.frame_count * params.candidates
     survey = survey_clip(reader, networks, subject.transfer, candidates, job.progress)
     selection = select_frames(survey, info, str(subject.video), frame_count=params.frame_count,
-                              max_size=params.max_size, blurred_below=params.blurred_below,
+                              max_size=params.max_size, blurred_below=params.min_sharpness,
                               moves=subject.moves)
     job.note(selection.summary)
     intrinsics, focal_known, focal_warning = source_intrinsics(

@@ -46,10 +46,12 @@ STAGE = Stage(
         Parameter("tracks", int, 5000, "Skin points tracked against the mean texture.", "points", 100, 20000),
         Parameter("texel", float, 1.0, "Texels of the mean texture.", "px", 0.5, 8.0),
         Parameter("window", float, 5.0, "Standard width of the windows that are matched.", "texels", 1.5, 30.0),
-        Parameter("point_prior", float, 10.0, "Deviation of track points about the fitted head.", "mm", 0.01, 1000.0),
+        Parameter("point_sigma", float, 10.0, "Deviation of track points about the fitted head.", "mm", 0.01, 1000.0,
+                  former="point_prior"),
         Parameter("fit", str, "robust", "Weights of the head fit.", choices=("robust", "published")),
         Parameter("stiffness", float, 20.0, "Stiffness of the free shape, per noise over relief.", "", 0.01, 1e6),
-        Parameter("least_presence", float, 0.5, "Landmark network's confidence below which a frame is lost.", "", 0, 1),
+        Parameter("min_confidence", float, 0.5, "Landmark network's confidence below which a frame is lost.", "", 0, 1,
+                  former="least_presence"),
         Parameter("outlier_factor", float, 4.0, "Frames that fit so many times worse are left out.", "", 1.5, 100.0),
     ),
 )
@@ -66,7 +68,7 @@ def read_landmarks(job: Job, frames) -> tuple[np.ndarray, np.ndarray]:
     networks, previous = load_face_networks(), None
     points, presence = np.zeros((frames.count, 468, 2)), np.zeros(frames.count)
     for i in job.progress(range(frames.count), "landmarks"):
-        presence[i], previous = networks.find(eight_bit(frames.read_codes(i)), previous, job.params.least_presence)
+        presence[i], previous = networks.find(eight_bit(frames.read_codes(i)), previous, job.params.min_confidence)
         if previous is not None:
             points[i] = previous[:, :2]
     return points, presence
@@ -120,7 +122,7 @@ def read_settings(job: Job, focal_known: bool):
         tracks=params.tracks,
         texel_px=params.texel,
         window_sigma=params.window,
-        prior_mm=params.point_prior,
+        prior_mm=params.point_sigma,
         estimate_focal=not focal_known,
         fit=PUBLISHED if params.fit == "published" else FitWeights(stiffness=params.stiffness),
     )
@@ -185,10 +187,10 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
     from shared.mesh import Mesh
     from shared.overlay import overlay_strip
     from shared.solve.first_poses import choose_references
-    from shared.solve.judge_track import judge_frames
+    from shared.solve.judge_track import frames_that_fit
     from shared.tracking_pictures import pose_curves, residual_map
 
-    fits, reasons = judge_frames(track, job.params.outlier_factor)
+    fits, reasons = frames_that_fit(track, job.params.outlier_factor)
     kept, poses, covariance = used[fits], track.camera_from_head[fits], track.covariance[fits]
     gain = track.focal_gain if track.focal_solved else 1.0
     lens = zoomed(frames.intrinsics, gain)
@@ -242,7 +244,7 @@ def run(job: Job) -> None:
             where=frames.source_name,
             got=f"{len(used)} frames with landmarks",
             expected="3 or more",
-            mend="film one head, facing the camera at the start, 200 px wide or more",
+            hint="film one head, facing the camera at the start, 200 px wide or more",
         )
     clip = build_clip(job, frames, used, landmarks_px, given_poses)
     track = track_head(clip, model, read_settings(job, frames.focal_known), job.progress, job.note)

@@ -11,10 +11,11 @@ import numpy as np
 from shared import brdf
 from tools.synth_light import EnvironmentLight
 from tools.synth_sampling import cosine_direction, tangent_frame
-from tools.synth_surface import ShadingPoints, Surface
+from tools.synth_surface import ShadingPoints, SyntheticSurface
 
 
-def reference_radiance(surface: Surface, light: EnvironmentLight, world_from_head: np.ndarray, points: ShadingPoints,
+def reference_radiance(surface: SyntheticSurface, light: EnvironmentLight, world_from_head: np.ndarray,
+                       points: ShadingPoints,
                        outgoing: np.ndarray, specular: np.ndarray, roughness: np.ndarray, paths: int,
                        seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Mean [N, 3] and standard error [N, 3] of the radiance that surface points send towards `outgoing` [N, 3].
@@ -58,7 +59,7 @@ def _from_frame(local: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return first * local[:, :1] + second * local[:, 1:2] + normal * local[:, 2:]
 
 
-def _incident(surface: Surface, light: EnvironmentLight, world_from_head: np.ndarray, origins: np.ndarray,
+def _incident(surface: SyntheticSurface, light: EnvironmentLight, world_from_head: np.ndarray, origins: np.ndarray,
               directions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """[N, 3] radiance along rays: the light, or one diffuse reflection of it at whatever the ray meets."""
     face, bary, _ = surface.scene.intersect(origins, directions)

@@ -17,10 +17,10 @@ from toy_capture import (
 )
 
 from shared.envmap import cube_directions
-from shared.lobes import LobeTable, specular_reflection
+from shared.lobes import SpecularTransfer, specular_reflection
 from shared.shading import light_along
-from shared.solve.appearance import AppearanceSolver, Settings
-from shared.solve.gloss_fit import GlossFit
+from shared.solve.appearance import AppearanceSettings, AppearanceSolver
+from shared.solve.gloss_fit import SpecularFit
 from shared.solve.light_step import LightStep
 from shared.transfer import nearest_points
 
@@ -48,7 +48,7 @@ def test_errors_of_frames_are_those_of_their_samples(truth):
     model = solver.colours + 0.1 * torch.from_numpy(half.astype(np.float32))[None, :, None]
     share = capture.samples.weight[half].sum(0) / capture.samples.weight.sum(0)
     assert solver.frame_errors(model) == pytest.approx(0.1 * share, rel=1e-4)
-    solver.limits[:] = 1
+    solver.saturation[:] = 1
     assert solver.frame_errors(model).max() == 0.0
 
 
@@ -57,9 +57,9 @@ def test_samples_that_the_model_cannot_follow_say_less(matte):
     weight = torch.ones_like(solver.colours)
     fitting = solver.evidence(weight)
     error = 2.0 * torch.ones_like(weight)
-    solver.measure_misfit(solver.colours + error, weight)
+    solver.measure_reduced_chi_square(solver.colours + error, weight)
     assert solver.evidence(weight) == pytest.approx(fitting / 4.0, rel=1e-3)
-    solver.measure_misfit(solver.colours + 0.1 * error, weight)
+    solver.measure_reduced_chi_square(solver.colours + 0.1 * error, weight)
     assert solver.evidence(weight) == pytest.approx(fitting, rel=1e-6)
 
 
@@ -70,20 +70,20 @@ def test_forward_model_is_the_composition_of_its_modules(truth):
     solver.bake_lobes()
     found, reflection = truly_lit(solver, capture)
     assert np.allclose(np.moveaxis(found.numpy(), 0, -1), light, rtol=0.01)
-    table = LobeTable(capture.points.normals, capture.transfer.visibility(), DIRECTIONS)
+    table = SpecularTransfer(capture.points.normals, capture.transfer.visibility(), DIRECTIONS)
     along = light_along(true_light(cube_directions(16)), DIRECTIONS, capture.world_from_head)
     expected = specular_reflection(table, capture.samples.towards_camera[:, 3], ROUGHNESS, along[:, 3])
     open_points = capture.transfer.blocked < 1e-3
     assert np.allclose(reflection[:, :, 3].numpy().T[open_points], expected[open_points], rtol=0.02, atol=1e-3)
 
 
-def test_elimination_is_weighted_least_squares(matte):
+def test_projected_albedo_is_weighted_least_squares(matte):
     """Albedo under the true light by brute force, and the truth itself to the noise."""
     capture, albedo, _ = matte
     solver = AppearanceSolver(capture, MATTE)
     light, reflection = truly_lit(solver, capture)
     weight = solver.weights(None)
-    found = solver.eliminate(light, 0.0 * reflection, weight)[..., 0].numpy().T
+    found = solver.best_albedo(light, 0.0 * reflection, weight)[..., 0].numpy().T
     assert np.abs(found / albedo - 1.0).max() < 0.03
     frames = capture.fitted
     for p in range(0, len(albedo), 40):
@@ -95,7 +95,7 @@ def test_elimination_is_weighted_least_squares(matte):
 
 
 def test_highlights_are_joint_least_squares(truth):
-    """The specular intensity with albedo eliminated is what one big least-squares problem gives."""
+    """The specular intensity with albedo projected out is what one big least-squares problem gives."""
     capture, _, _ = truth
     some = np.arange(0, len(capture.points), 9)
     capture = replace(
@@ -126,7 +126,7 @@ def test_highlights_are_joint_least_squares(truth):
 def test_clipped_samples_do_not_bias(one_thread):
     """Many red samples end at the clipping level; the light being known, albedo must not suffer."""
     capture, albedo, _ = make_truth(specular=0.0, clip_at=0.45)
-    clipped = (capture.samples.limits[..., 0] > 0) & (capture.samples.weight > 0)
+    clipped = (capture.samples.saturation[..., 0] > 0) & (capture.samples.weight > 0)
     solver = AppearanceSolver(capture, MATTE)
     light, reflection = truly_lit(solver, capture)
     used = (capture.samples.weight > 0) & capture.fitted
@@ -135,7 +135,7 @@ def test_clipped_samples_do_not_bias(one_thread):
     assert partly.sum() > 20
 
     def error(weight):
-        found = solver.eliminate(light, 0.0 * reflection, weight)[0, :, 0].numpy()
+        found = solver.best_albedo(light, 0.0 * reflection, weight)[0, :, 0].numpy()
         return float(np.median(found[partly] / albedo[partly, 0])) - 1.0
 
     solver.state.albedo = albedo
@@ -186,7 +186,7 @@ def test_steps_lower_the_cost_and_keep_the_mean_irradiance(matte):
     step = LightStep(solver)
     _, before, gauge = solver.mean_on_skin(step.albedo, step.irradiance)
     assert np.allclose((solver.state.light * gauge).sum(0), 1.0, rtol=1e-3)
-    step.take()
+    step.update()
     assert step.cost(solver.state.params) < 0.5 * step.before
     _, after, _ = solver.mean_on_skin(step.albedo, solver.forward(solver.state.light)[0])
     assert np.abs(after - before).max() < 0.5
@@ -203,7 +203,7 @@ def test_roughness_comes_to_the_truth_under_the_true_light(truth):
         solver.bake()
         solver.bake_lobes()
         for _ in range(5):
-            solver.roughen(LightStep(solver).gloss.change_of_roughness)
+            solver.update_roughness(LightStep(solver).specular_fit.change_of_roughness)
         assert solver.state.roughness == pytest.approx(ROUGHNESS, rel=0.03)
 
 
@@ -220,15 +220,15 @@ def test_intensity_and_roughness_are_joint_least_squares(truth):
     weight = solver.weights(None) * solver.fitted
     change = 0.1 * reflection - 0.2 * SPECULAR * slope
     solver.colours = diffuse + SPECULAR * reflection + change
-    fit = GlossFit(solver, light, reflection, slope, weight, 1e3)
+    fit = SpecularFit(solver, light, reflection, slope, weight, 1e3)
     assert np.allclose(fit.best, [SPECULAR + 0.1, -0.2], rtol=0.01)
     assert torch.allclose(fit.highlights, SPECULAR * reflection + change, atol=1e-3)
-    pure = solver.off_albedo(change, light, weight)
+    pure = solver.project_off_albedo(change, light, weight)
     assert float((weight * fit.off(pure).square()).sum()) < 1e-3 * float((weight * pure.square()).sum())
     # Known in advance, they stay.
     certain = replace(GLOSSY, specular_prior=(0.7, 1e-6))
     solver.settings = certain
-    assert GlossFit(solver, light, reflection, None, weight, 1e3).best == pytest.approx([0.7], abs=1e-3)
+    assert SpecularFit(solver, light, reflection, None, weight, 1e3).best == pytest.approx([0.7], abs=1e-3)
 
 
 def test_light_between_surfaces_that_send_everything_on_comes_to_an_end(truth):
@@ -236,7 +236,7 @@ def test_light_between_surfaces_that_send_everything_on_comes_to_an_end(truth):
     capture = truth[0]
     count = len(capture.nodes.points)
     closed = replace(capture.node_transfer, bounce=np.full((count, count), 1.0 / count, np.float32))
-    solver = AppearanceSolver(replace(capture, node_transfer=closed), Settings(specular=False))
+    solver = AppearanceSolver(replace(capture, node_transfer=closed), AppearanceSettings(specular=False))
     solver.state.node_albedo[:] = 1.0
     solver.bake()
     assert torch.isfinite(solver.baked).all() and (solver.baked >= solver.direct).all()
@@ -257,6 +257,6 @@ def test_points_of_few_samples_follow_the_scale(matte):
     solver.state.params += np.log(4.0)
     solver.state.albedo /= 4.0
     step = LightStep(solver)
-    assert step.settle() > 1.0
-    again = solver.eliminate(step.irradiance, torch.zeros_like(step.irradiance), step.weight)
+    assert step.resolve_scale() > 1.0
+    again = solver.best_albedo(step.irradiance, torch.zeros_like(step.irradiance), step.weight)
     assert float((step.albedo / again - 1.0).abs().max()) < 0.1

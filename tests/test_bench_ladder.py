@@ -1,4 +1,4 @@
-"""The benchmark of the ladder: what it compares, and that an interrupted table goes on."""
+"""The benchmark of model selection: what it compares, and that an interrupted table goes on."""
 
 import pytest
 
@@ -6,8 +6,9 @@ from tools import bench_ladder
 from tools.bench_ladder import compare, main, read_rows, write_rows
 
 
-def row(clip, rung, mesh, error, seconds):
-    return {"clip": clip, "rung": rung, "mesh": mesh, "held_out": 1.2 * error, "held_out_abs": error, "cpu_s": seconds,
+def row(clip, candidate, mesh, error, seconds):
+    return {"clip": clip, "rung": candidate, "mesh": mesh, "held_out": 1.2 * error, "held_out_abs": error,
+            "cpu_s": seconds,
             "light": "cubemap 8", "visibility": "bounces", "specular": True, "chosen": ""}
 
 
@@ -15,7 +16,7 @@ TABLE = [row("a", "auto", "tracked", 0.0103, 12.0), row("a", "least", "tracked",
          row("a", "cubemap_16", "tracked", 0.011, 30.0), row("a", "cubemap_16", "refined", 0.010, 60.0)]
 
 
-def test_the_ladder_is_compared_with_the_best_fixed_rung():
+def test_model_selection_is_compared_with_the_best_fixed_candidate():
     (found,) = compare(TABLE)
     assert found["best_fixed"] == "cubemap_16, refined"
     assert found["error_ratio"] == pytest.approx(1.03) and found["square_ratio"] == pytest.approx(1.03)
@@ -29,14 +30,14 @@ def test_rows_survive_the_table_and_are_not_measured_again(tmp_path, monkeypatch
     assert [float(old["held_out_abs"]) for old in read_rows(table)] == [0.0103, 0.02]
     measured = []
 
-    def measure(inputs, clip, rung, given):
-        measured.append((clip, rung, given))
-        return [row(clip, rung, mesh, 0.01, 60.0) for mesh in ("tracked", "refined")]
+    def measure(inputs, clip, candidate, given):
+        measured.append((clip, candidate, given))
+        return [row(clip, candidate, mesh, 0.01, 60.0) for mesh in ("tracked", "refined")]
 
     monkeypatch.setattr(bench_ladder, "measure", measure)
     monkeypatch.setattr(bench_ladder, "compile_loops", lambda: None)
     monkeypatch.setattr(bench_ladder, "read_inputs", lambda *folders: None)
-    arguments = ["--rungs", "auto", "least", "cubemap_16", "--set", "points=500", "--out", str(table)]
+    arguments = ["--candidates", "auto", "least", "cubemap_16", "--set", "points=500", "--out", str(table)]
     assert main([str(tmp_path / "a"), *arguments]) == 0
     assert measured == [("a", "cubemap_16", {"points": "500"})]
     assert len(read_rows(table)) == 4

@@ -24,17 +24,17 @@ def test_flicker_changes_whole_frames_by_about_a_fifth():
 
 
 def test_rolling_exposure_makes_bands_along_the_rows():
-    spoilt = perturb.rolling_exposure(grey(), 3, 10).astype(float)
-    assert np.ptp(spoilt, axis=1).max() == 0
-    assert np.ptp(spoilt[:, 0, 0]) > 8
-    assert np.abs(spoilt - perturb.rolling_exposure(grey(), 4, 10)).max() > 2
+    degraded = perturb.rolling_exposure(grey(), 3, 10).astype(float)
+    assert np.ptp(degraded, axis=1).max() == 0
+    assert np.ptp(degraded[:, 0, 0]) > 8
+    assert np.abs(degraded - perturb.rolling_exposure(grey(), 4, 10)).max() > 2
 
 
 def test_motion_blur_spreads_a_dot_along_its_row_only():
     dot = np.zeros((9, 9, 3), np.uint8)
     dot[4, 4] = 200
-    spoilt = perturb.motion_blur(dot, 0, 1)[..., 0]
-    assert spoilt[4, 3:6].tolist() == [50, 100, 50] and spoilt.sum() == 200
+    degraded = perturb.motion_blur(dot, 0, 1)[..., 0]
+    assert degraded[4, 3:6].tolist() == [50, 100, 50] and degraded.sum() == 200
 
 
 def landmarks():
@@ -64,7 +64,7 @@ def test_five_stretches_of_landmarks_are_missing():
 
 
 def test_a_copy_with_fewer_frames_keeps_their_truth(tmp_path):
-    perturb.spoil_pixels(TINY_SUBJECT, tmp_path / "copy", lambda codes, index, count: codes, slice(None, None, -3))
+    perturb.degrade_pixels(TINY_SUBJECT, tmp_path / "copy", lambda codes, index, count: codes, slice(None, None, -3))
     copy = load_subject(tmp_path / "copy")
     true = load_arrays(TINY_SUBJECT / "gt" / "poses.npz")["camera_from_head"]
     assert np.array_equal(load_arrays(tmp_path / "copy" / "gt" / "poses.npz")["camera_from_head"], true[::-3])
@@ -76,16 +76,16 @@ def test_a_copy_with_fewer_frames_keeps_their_truth(tmp_path):
 
 
 def test_a_wrong_focal_length_is_all_that_changes(tmp_path):
-    perturb.spoil_focal(TINY_SUBJECT, tmp_path / "copy", 1.1)
+    perturb.degrade_focal(TINY_SUBJECT, tmp_path / "copy", 1.1)
     original, copy = load_subject(TINY_SUBJECT), load_subject(tmp_path / "copy")
     assert copy.focal_length_mm == pytest.approx(1.1 * original.focal_length_mm)
     assert copy.sensor_width_mm == original.sensor_width_mm
     assert [file.read_bytes() for file in copy.video_files()] == [file.read_bytes() for file in original.video_files()]
 
 
-def test_spoilt_landmarks_come_as_a_file_in_source_pixels(tiny_run, tmp_path):
+def test_degraded_landmarks_come_as_a_file_in_source_pixels(tiny_run, tmp_path):
     tracked = tiny_run / "work" / "track_landmarks"
-    perturb.spoil_landmarks(TINY_SUBJECT, tracked, tmp_path / "copy", lambda points, yaw, rng: points + [2.0, 0.0])
+    perturb.degrade_landmarks(TINY_SUBJECT, tracked, tmp_path / "copy", lambda points, yaw, rng: points + [2.0, 0.0])
     content = yaml.safe_load((tmp_path / "copy" / "subject.yaml").read_text())
     assert content["tracking"] == {"landmarks": "landmarks.npz"}
     from shared.io.frames import FrameSet
@@ -121,7 +121,7 @@ def test_a_clip_without_truth_can_be_run_backwards(tmp_path):
     for number, frame in enumerate(frames):
         write_png(subject / "frames" / f"{number:04d}.png", frame)
     (subject / "subject.yaml").write_text("video: frames/%04d.png\n")
-    perturb.spoil_pixels(subject, tmp_path / "copy", perturb.unspoilt, slice(None, None, -1))
+    perturb.degrade_pixels(subject, tmp_path / "copy", perturb.unchanged, slice(None, None, -1))
     for number, frame in enumerate(frames[::-1]):
         assert (read_png(tmp_path / "copy" / "frames" / f"{number:04d}.png") == frame).all()
     assert not (tmp_path / "copy" / "gt").exists()

@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from shared.bundle import BundleSolution, adjust, place_points, pose_covariance, resect, zoomed
-from shared.bundle_problem import BundleProblem, State, Tracks, moved
+from shared.bundle_problem import BundleProblem, BundleState, Tracks, moved
 from shared.geometry import project, rigid, rotation_from_vector, similarity_from_points, vector_from_rotation
 from shared.motion_prior import MotionPrior
 from shared.pnp import pose_from_points
@@ -125,7 +125,7 @@ def tiny_problem(**more):
     whitening = np.eye(2) * 3.0 + rng.normal(size=(4, 10, 2, 2))
     problem = BundleProblem(Tracks(observed, whitening), cloud, LENS, loss_scale=2.0, prior_mm=20.0, **more)
     start, points = shaken(poses, cloud)
-    return problem, State(start, points, 0.02 if more.get("refine_focal") else 0.0)
+    return problem, BundleState(start, points, 0.02 if more.get("refine_focal") else 0.0)
 
 
 def numeric(function, size, step):
@@ -137,12 +137,13 @@ def test_right_hand_sides_are_the_cost_s_gradient():
     problem, state = tiny_problem(refine_focal=True)
     block = problem.linearised(state, slice(0, 10))
     by_camera = numeric(
-        lambda d: problem.cost(State(moved(state.poses, d.reshape(4, 6)), state.points, state.log_focal)), 24, 1e-6
+        lambda d: problem.cost(BundleState(moved(state.poses, d.reshape(4, 6)), state.points, state.log_focal)), 24,
+        1e-6
     )
     by_point = numeric(
-        lambda d: problem.cost(State(state.poses, state.points + d.reshape(10, 3), state.log_focal)), 30, 1e-4
+        lambda d: problem.cost(BundleState(state.poses, state.points + d.reshape(10, 3), state.log_focal)), 30, 1e-4
     )
-    by_focal = numeric(lambda d: problem.cost(State(state.poses, state.points, state.log_focal + d[0])), 1, 1e-6)
+    by_focal = numeric(lambda d: problem.cost(BundleState(state.poses, state.points, state.log_focal + d[0])), 1, 1e-6)
     assert np.allclose(-2 * block.camera_rhs.ravel(), by_camera, rtol=1e-4, atol=1e-4 * np.abs(by_camera).max())
     assert np.allclose(-2 * block.point_rhs.ravel(), by_point, rtol=1e-4, atol=1e-5 * np.abs(by_point).max())
     assert -2 * block.focal_rhs == pytest.approx(by_focal[0], rel=1e-4)
@@ -193,7 +194,7 @@ def test_adjustment_lands_where_scipy_lands():
     best = least_squares(residuals, np.zeros(60), x_scale=np.r_[np.tile([0.01] * 3 + [10.0] * 3, 4), np.ones(36)])
     solution = adjust(tracks, poses, cloud, LENS, loss_scale=NO_LOSS, prior_mm=20.0, max_iterations=200)
     cost = BundleProblem(tracks, cloud, LENS, loss_scale=NO_LOSS, prior_mm=20.0).cost(
-        State(solution.camera_from_points, solution.points)
+        BundleState(solution.camera_from_points, solution.points)
     )
     assert cost == pytest.approx(2 * best.cost, rel=1e-3)
     expected = moved(poses, best.x[:24].reshape(4, 6))

@@ -6,14 +6,14 @@ import pytest
 from toy_chart import CENTRED, chart_pose
 from toy_head import toy_head
 
-from shared.chart import CORNERS, PATCHES, ChartSight, patch_sigma, reflectances, usable
+from shared.chart import CORNERS, PATCHES, ChartObservation, patch_sigma, reflectances, usable
 from shared.contract.fields import below, field_faults
 from shared.contract.records import SOLVE
 from shared.envmap import cube_directions
 from shared.geometry import WORLD_FROM_CAMERA, rigid
 from shared.raycast import RayScene
-from shared.solve.chart_scale import chart_normals, describe_scale, doubt_scale, state_chart
-from shared.solve.scale import Highlights, settle_scale
+from shared.solve.chart_scale import chart_normals, describe_scale, scale_warnings, state_chart
+from shared.solve.scale import Highlights, resolve_scale
 
 INTRINSICS = np.array([[1500.0, 0.0, 480.0], [0.0, 1500.0, 320.0], [0.0, 0.0, 1.0]])
 PITCH_MM, DISTANCE_MM = 25.0, 900.0
@@ -29,13 +29,13 @@ def corners_of(rotation, place):
     return points[:, :2] / points[:, 2:] * 1500.0 + [480.0, 320.0]
 
 
-def sight_of(white, rotation=None, place=(210.0, 0.0, DISTANCE_MM), frame=0):
+def observation_of(white, rotation=None, place=(210.0, 0.0, DISTANCE_MM), frame=0):
     """A chart whose every patch receives the irradiance over pi `white`, [3] or [24, 3]."""
     rotation = np.eye(3) if rotation is None else rotation
     values = np.maximum(reflectances(), 0.0) * white
     weight = usable(UNCLIPPED) / patch_sigma() ** 2
     middle, corners = np.broadcast_to(white, (PATCHES, 3)).mean(0), corners_of(rotation, np.array(place))
-    return ChartSight(corners, values, weight, middle, np.full(3, 0.02), frame, 10 * frame)
+    return ChartObservation(corners, values, weight, middle, np.full(3, 0.02), frame, 10 * frame)
 
 
 def sun_and_sky(resolution=16):
@@ -77,7 +77,8 @@ def test_a_light_of_known_irradiance_gets_its_factor(tilt):
     rotation, factor = chart_pose(0, tilt), np.array([1.5, 1.2, 0.8])
     light = sun_and_sky()
     white = irradiance_over_pi(light, WORLD_FROM_CAMERA @ -rotation[:, 2])
-    statement, warning = state_chart([sight_of(factor * white, rotation)], far_scene(), POSE[None], INTRINSICS, "head")
+    statement, warning = state_chart([observation_of(factor * white, rotation)], far_scene(), POSE[None], INTRINSICS,
+                                     "head")
     found, covariance = statement.log_factor(light, SKIN)
     assert warning == ""
     np.testing.assert_allclose(found, np.log(factor), atol=0.02)
@@ -92,8 +93,8 @@ def test_the_camera_carried_around_turns_the_chart_with_the_head():
     turn = chart_pose(0, 30)
     pose = rigid(turn @ WORLD_FROM_CAMERA, np.array([0.0, 0.0, DISTANCE_MM]))
     white = irradiance_over_pi(light, pose[:3, :3].T @ -rotation[:, 2])
-    sights = [sight_of(white, rotation, frame=1)]
-    statement, _ = state_chart(sights, far_scene(), np.stack([POSE, pose]), INTRINSICS, "camera")
+    observations = [observation_of(white, rotation, frame=1)]
+    statement, _ = state_chart(observations, far_scene(), np.stack([POSE, pose]), INTRINSICS, "camera")
     np.testing.assert_allclose(statement.log_factor(light, SKIN)[0], 0.0, atol=0.02)
 
 
@@ -101,8 +102,8 @@ def test_in_a_white_furnace_the_head_beside_it_changes_nothing():
     """What the head covers it returns: with skin as bright as the sky every place and depth sees the same light."""
     mesh = toy_head(3).mesh(np.zeros(2), np.zeros(1))
     light = np.full((6 * 8**2, 3), 0.5)
-    sights = [sight_of(np.full(3, 0.5), place=(place, 0.0, DISTANCE_MM)) for place in (130.0, 200.0)]
-    statement, _ = state_chart(sights, RayScene(mesh.vertices, mesh.faces), POSE[None], INTRINSICS, "head")
+    observations = [observation_of(np.full(3, 0.5), place=(place, 0.0, DISTANCE_MM)) for place in (130.0, 200.0)]
+    statement, _ = state_chart(observations, RayScene(mesh.vertices, mesh.faces), POSE[None], INTRINSICS, "head")
     np.testing.assert_allclose(statement.log_factor(light, np.full(3, 0.5))[0], 0.0, atol=0.01)
     assert min(view.free.mean() for view in statement.views) < 0.99
 
@@ -112,13 +113,13 @@ def test_a_head_that_shades_the_chart_is_allowed_for():
     the factor would be too low by the mean shade."""
     mesh = toy_head(3).mesh(np.zeros(2), np.zeros(1))
     scene, light = RayScene(mesh.vertices, mesh.faces), np.full((6 * 8**2, 3), 0.5)
-    even = sight_of(np.full(3, 0.5), place=(145.0, 0.0, DISTANCE_MM))
+    even = observation_of(np.full(3, 0.5), place=(145.0, 0.0, DISTANCE_MM))
     statement, _ = state_chart([even], scene, POSE[None], INTRINSICS, "head")
     view = statement.views[0]
     at_head = view.free.reshape(-1, PATCHES, view.free.shape[1])[6]
     shade = (at_head @ view.cosine[:, 0]) / view.cosine[:, 0].sum()
     assert 0.5 < shade.min() < 0.9 < shade.max()
-    shaded = sight_of(0.5 * np.repeat(shade[:, None], 3, 1), place=(145.0, 0.0, DISTANCE_MM))
+    shaded = observation_of(0.5 * np.repeat(shade[:, None], 3, 1), place=(145.0, 0.0, DISTANCE_MM))
     factors = [state_chart([shaded], some, POSE[None], INTRINSICS, "head")[0].log_factor(light, np.zeros(3))[0]
                for some in (scene, far_scene())]
     assert (factors[1] < np.log(shade.mean()) + 0.01).all()
@@ -128,13 +129,13 @@ def test_a_head_that_shades_the_chart_is_allowed_for():
 def test_one_odd_view_does_not_carry_the_day():
     light = sun_and_sky()
     white = irradiance_over_pi(light, np.array([0.0, 0.0, 1.0]))
-    sights = [sight_of(white), sight_of(white), sight_of(0.4 * white)]
-    statement, _ = state_chart(sights, far_scene(), POSE[None], INTRINSICS, "head")
+    observations = [observation_of(white), observation_of(white), observation_of(0.4 * white)]
+    statement, _ = state_chart(observations, far_scene(), POSE[None], INTRINSICS, "head")
     np.testing.assert_allclose(statement.log_factor(light, SKIN)[0], 0.0, atol=0.02)
 
 
 def test_a_chart_turned_away_is_not_used_and_none_says_nothing():
-    away = sight_of(np.ones(3), chart_pose(0, 72))
+    away = observation_of(np.ones(3), chart_pose(0, 72))
     statement, warning = state_chart([away], far_scene(), POSE[None], INTRINSICS, "head")
     assert statement is None and "turned away" in warning
     assert state_chart([], far_scene(), POSE[None], INTRINSICS, "head") == (None, "")
@@ -144,14 +145,14 @@ def test_the_scale_follows_the_chart_against_the_priors():
     log_albedo, log_irradiance = np.log([0.5, 0.3, 0.22]), np.log([1.0, 1.0, 1.0])
     wanted = np.log([0.6, 0.5, 0.45])
     covariance = np.full((3, 3), 0.04**2) + np.diag(np.full(3, 0.012**2))
-    alone, _ = settle_scale(log_albedo, log_irradiance, None, (0.7, 0.25))
-    found, _ = settle_scale(log_albedo, log_irradiance, None, (0.7, 0.25), chart=(wanted, covariance))
+    alone, _ = resolve_scale(log_albedo, log_irradiance, None, (0.7, 0.25))
+    found, _ = resolve_scale(log_albedo, log_irradiance, None, (0.7, 0.25), chart=(wanted, covariance))
     assert np.abs(alone - wanted).max() > 0.2
     np.testing.assert_allclose(found, wanted, atol=0.03)
-    weak, _ = settle_scale(log_albedo, log_irradiance, None, (0.7, 0.25), chart=(wanted, covariance * 1e6))
+    weak, _ = resolve_scale(log_albedo, log_irradiance, None, (0.7, 0.25), chart=(wanted, covariance * 1e6))
     np.testing.assert_allclose(weak, alone, atol=0.01)
     shiny = Highlights(np.full(3, 0.6), np.full(3, 1e4), np.full(3, 8.0))
-    with_shine, specular = settle_scale(log_albedo, log_irradiance, shiny, (0.7, 0.25), chart=(wanted, covariance))
+    with_shine, specular = resolve_scale(log_albedo, log_irradiance, shiny, (0.7, 0.25), chart=(wanted, covariance))
     np.testing.assert_allclose(with_shine, found, atol=1e-9)
     wished = 0.6 / np.exp(found).mean()
     assert 0.7 < specular < wished  # between the prior's mean and the samples, and nearer to them
@@ -161,11 +162,11 @@ def test_the_scale_follows_the_chart_against_the_priors():
 def test_what_is_recorded():
     skin = np.array([0.5, 0.3, 0.22])
     assert "chart" not in describe_scale(None, skin)
-    statement, _ = state_chart([sight_of(np.ones(3), frame=0)], far_scene(), POSE[None], INTRINSICS, "head")
+    statement, _ = state_chart([observation_of(np.ones(3), frame=0)], far_scene(), POSE[None], INTRINSICS, "head")
     described = describe_scale(statement, skin)
     assert field_faults(described, below(SOLVE, "albedo_scale")) == []
     assert described["method"].startswith("a colour chart") and described["chart"]["frames"] == [0]
     assert described["chart"]["irradiance_over_pi"] == [1.0, 1.0, 1.0]
     assert (np.abs(np.log(described["chart"]["priors_alone_factor"])) < 0.3).all()
-    assert doubt_scale(statement, skin) == [] == doubt_scale(None, 3 * skin)
-    assert "in the face's own light" in doubt_scale(statement, 3 * skin)[0]
+    assert scale_warnings(statement, skin) == [] == scale_warnings(None, 3 * skin)
+    assert "in the face's own light" in scale_warnings(statement, 3 * skin)[0]

@@ -10,7 +10,7 @@ import sys
 import pytest
 from toy_runs import REPOSITORY, copy_pipeline, limn, make_subject, outputs_of, tree
 
-from shared.contract.needs import Scale, measured_scale
+from shared.contract.needs import WorkSize, measured_scale
 from shared.contract.pipeline import load_pipeline
 from shared.contract.subject import load_subject
 from shared.errors import InputError
@@ -175,9 +175,9 @@ def test_work_on_all_clips_books_for_the_frames_of_all(tmp_path):
         folder = tmp_path / "work" / "clips" / clip / "work" / "sample_frames"
         folder.mkdir(parents=True)
         (folder / "frames.json").write_text(json.dumps({"size": size, "frames": [0] * frames}))
-    assert measured_scale(tmp_path, Scale(150, 1024, 512)) == Scale(42, 300, 512)
-    assert measured_scale(tmp_path / "work" / "clips" / "sun", Scale(150, 1024, 512)) == Scale(30, 200, 512)
-    assert measured_scale(tmp_path / "gone", Scale(150, 1024, 512)) == Scale(150, 1024, 512)
+    assert measured_scale(tmp_path, WorkSize(150, 1024, 512)) == WorkSize(42, 300, 512)
+    assert measured_scale(tmp_path / "work" / "clips" / "sun", WorkSize(150, 1024, 512)) == WorkSize(30, 200, 512)
+    assert measured_scale(tmp_path / "gone", WorkSize(150, 1024, 512)) == WorkSize(150, 1024, 512)
 
 
 def test_status_and_clean_see_all_clips(finished, tmp_path, capsys):

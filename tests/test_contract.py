@@ -183,7 +183,7 @@ def test_failure_keeps_log_and_earlier_result(call, tmp_path, capsys):
 def test_input_error_inside_a_stage_leaves_nothing(call, tmp_path, capsys):
     def blind(job):
         write_text(job)
-        raise InputError("no face", where="frame 3", mend="film a face")
+        raise InputError("no face", where="frame 3", hint="film a face")
 
     before = tree(tmp_path)
     assert call(blind) == 2

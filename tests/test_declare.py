@@ -12,6 +12,8 @@ from shared.contract.manifest import source_inputs
 from shared.contract.pipeline import load_pipeline, split_settings
 from shared.contract.source import fingerprint, read_declaration
 from shared.errors import InputError, LimnError
+from stages import inverse_render
+from tools.limn import main
 
 
 @pytest.mark.parametrize("name, value, parsed", [
@@ -31,6 +33,25 @@ def test_bad_values_say_what_is_allowed(name, value, hint):
     with pytest.raises(InputError, match=name) as error:
         READ_TEXT.parse({name: value}, "here")
     assert hint in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_former_name_is_refused_with_the_new_one(tmp_path, capsys):
+    """Nobody's settings change their meaning in silence: neither on a command line nor in pipeline.yaml."""
+    with pytest.raises(InputError) as error:
+        inverse_render.STAGE.parse({"evidence": "5000"}, "--set")
+    assert str(error.value) == ("--set: parameter inverse_render.evidence has another name now; "
+                                "write inverse_render.independent_samples")
+    assert inverse_render.STAGE.parse({"independent_samples": "5000"}, "--set") == {"independent_samples": 5000.0}
+    assert main(["run", str(tmp_path), "--set", "sample_frames.blurred_below=0"]) == 2
+    line = capsys.readouterr().err
+    assert "write sample_frames.min_sharpness" in line and line.count("\n") == 1
+
+
+def test_a_former_name_is_no_other_parameter_s():
+    size = Parameter("size", int, 1, "Size.")
+    output = Output("words.txt", "Words.")
+    with pytest.raises(ValueError, match="unique parameters"):
+        Stage("read_text", 1, "Reads.", (), (output,), (size, Parameter("edge", int, 1, "Edge.", former="size")))
 
 
 def test_bad_default_is_refused():

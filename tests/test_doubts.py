@@ -10,12 +10,12 @@ from toy_head import toy_head
 
 from shared.errors import InputError
 from shared.io.images import write_exr
-from shared.solve.appearance import AppearanceSolver, Settings
-from shared.solve.doubts import by_orientation, doubts_about, face_regions, signs_of, unlikely_colour
+from shared.solve.appearance import AppearanceSettings, AppearanceSolver
+from shared.solve.doubts import by_orientation, diagnostic_warnings, diagnostics_of, face_regions, unlikely_colour
 from shared.solve.fit_appearance import fit_appearance
 from stages.inverse_render import check
 
-MATTE = Settings(resolutions=(6,), steps=5, specular=False, noise=(0.003, 0.01))
+MATTE = AppearanceSettings(resolutions=(6,), steps=5, specular=False, noise=(0.003, 0.01))
 
 
 @pytest.fixture(scope="module")
@@ -23,38 +23,38 @@ def capture(one_thread):
     return make_truth(specular=0.0)[0]
 
 
-def signs(capture, colours=None, regions=None):
+def diagnostics(capture, colours=None, regions=None):
     if colours is not None:
         capture = replace(capture, samples=replace(capture.samples, colours=colours.astype(np.float32)))
-    return signs_of(AppearanceSolver.at(capture, MATTE, fit_appearance(capture, MATTE).state), regions)
+    return diagnostics_of(AppearanceSolver.at(capture, MATTE, fit_appearance(capture, MATTE).state), regions)
 
 
 @pytest.fixture(scope="module")
 def calm(capture):
-    return signs(capture)
+    return diagnostics(capture)
 
 
 def test_a_good_clip_shows_none(calm):
     assert calm["frame_gain"] < 0.012 and calm["frame_tint"] < 0.012 and calm["unlikely_colour"] < 2.0
-    assert doubts_about(calm) == []
+    assert diagnostic_warnings(calm) == []
 
 
 def test_wandering_exposure_and_white_balance_are_told_apart(capture, calm):
     # Half of it can pass for light: no two of the few frames look the same way.
     wave = 0.1 * np.where(np.arange(FRAMES) % 2, 1.0, -1.0)
-    brighter = signs(capture, capture.samples.colours * np.exp(wave)[None, :, None])
+    brighter = diagnostics(capture, capture.samples.colours * np.exp(wave)[None, :, None])
     assert 0.045 < brighter["frame_gain"] < 0.12 and brighter["frame_tint"] < 0.02
-    redder = signs(capture, capture.samples.colours * np.exp(wave[:, None] * [0.5, 0.0, -0.5]))
+    redder = diagnostics(capture, capture.samples.colours * np.exp(wave[:, None] * [0.5, 0.0, -0.5]))
     assert 0.045 < redder["frame_tint"] < 0.12 and redder["frame_gain"] < 0.02
-    assert "brightness wanders" in doubts_about(brighter)[0] and len(doubts_about(brighter)) == 1
-    assert "colour wanders" in doubts_about(redder)[0] and len(doubts_about(redder)) == 1
+    assert "brightness wanders" in diagnostic_warnings(brighter)[0] and len(diagnostic_warnings(brighter)) == 1
+    assert "colour wanders" in diagnostic_warnings(redder)[0] and len(diagnostic_warnings(redder)) == 1
 
 
 def test_light_that_turns_along_is_seen_in_the_albedo(capture, calm):
     """A lamp before the forehead, much stronger than the room, shades each point alike in all frames."""
     lit = np.clip(capture.points.normals @ [0.0, 0.64, 0.77], 0.0, None)
     colours = 0.1 * capture.samples.colours + 0.9 * lit[:, None, None] * capture.samples.colours.mean(1, keepdims=True)
-    found = signs(capture, colours)
+    found = diagnostics(capture, colours)
     assert found["albedo_by_orientation"] > calm["albedo_by_orientation"] + 0.2
 
 
@@ -85,11 +85,11 @@ def test_what_stands_before_the_skin_is_told_with_its_place(capture, calm):
     hidden = regions["eyes"] & (np.arange(len(regions["eyes"])) % 2 == 0)
     colours = np.array(capture.samples.colours)
     colours[np.ix_(hidden, np.arange(FRAMES) % 2 == 0)] *= 0.1
-    found = [signs(capture, given, regions) for given in (None, colours)]
+    found = [diagnostics(capture, given, regions) for given in (None, colours)]
     assert found[0]["covered_eyes"] < 0.1 and found[1]["covered_eyes"] == pytest.approx(0.5, abs=0.1)
     assert "covered_eyes" not in calm
-    assert doubts_about(found[0]) == []
-    assert any("around the eyes" in text and "glasses" in text for text in doubts_about(found[1]))
+    assert diagnostic_warnings(found[0]) == []
+    assert any("around the eyes" in text and "glasses" in text for text in diagnostic_warnings(found[1]))
 
 
 def test_regions_of_a_face_are_where_its_segments_are():

@@ -35,8 +35,8 @@ from shared.io.export_maps import MAPS, acescg_from_rec709, paste_crop
 from shared.io.images import read_exr, read_png, write_exr
 from shared.io.meshes import read_obj
 from shared.io.usd import VARIANT_SET, VARIANT_STILL, prim_name
-from shared.io.usd_capture import Capture, define_camera, define_dome_light
-from shared.io.usd_material import Texture, modulated_ior
+from shared.io.usd_capture import UsdCapture, define_camera, define_dome_light
+from shared.io.usd_material import TextureFile, modulated_ior
 from shared.io.usd_validate import package_errors, usd_errors
 from shared.io.usdz import write_usdz
 from shared.mesh import Mesh, vertex_normals
@@ -221,9 +221,9 @@ def test_light_stands_still_while_the_head_turns(exported, moves):
 
 
 def test_a_lamp_at_the_camera_goes_with_it():
-    capture = Capture(toy_poses(), FRAMES, 25.0, INTRINSICS, *SOURCE_SIZE, "camera", light_with_camera=True)
+    capture = UsdCapture(toy_poses(), FRAMES, 25.0, INTRINSICS, *SOURCE_SIZE, "camera", light_with_camera=True)
     stage = Usd.Stage.CreateInMemory()
-    light = define_dome_light(stage, "/light", Texture("./envmap.exr"), capture)
+    light = define_dome_light(stage, "/light", TextureFile("./envmap.exr"), capture)
     camera = define_camera(stage, "/camera", capture)
     for frame in FRAMES:
         first, second = (prim.ComputeLocalToWorldTransform(float(frame)) for prim in (light, camera))
@@ -582,5 +582,5 @@ def test_mesh_errors_and_warnings():
 
 
 def test_capture_without_a_lens_assumes_full_frame():
-    capture = Capture(toy_poses(), FRAMES, 25.0, INTRINSICS, *SOURCE_SIZE, "head")
+    capture = UsdCapture(toy_poses(), FRAMES, 25.0, INTRINSICS, *SOURCE_SIZE, "head")
     assert capture.film_width_mm == 36.0

@@ -9,11 +9,11 @@ from shared.gather import (
     MAXIMUM_LEAST_COSINE,
     MINIMUM_VIEW_COSINE,
     SurfaceViewer,
-    gather_samples,
     prepare_picture,
     sample_colours,
     sample_inside,
-    sample_limits,
+    sample_points_in_frames,
+    sample_saturation,
     texel_size,
 )
 from shared.geometry import rigid
@@ -81,12 +81,13 @@ def test_clipped_and_crushed_channels_are_marked():
     codes = np.full((64, 64, 3), 128, np.uint8)
     codes[10:20, 10:20, 0] = 255
     codes[40:50, 40:50, 2] = 0
-    limits = flat_picture(64, 64, codes=codes).limits
-    found = sample_limits(limits, np.array([[15.0, 15.0], [45.0, 45.0], [30.0, 30.0]]))
+    saturation = flat_picture(64, 64, codes=codes).saturation
+    found = sample_saturation(saturation, np.array([[15.0, 15.0], [45.0, 45.0], [30.0, 30.0]]))
     assert found.tolist() == [[1, 0, 0], [0, 0, -1], [0, 0, 0]]
     codes16 = (codes.astype(np.uint16) * 257).astype(np.uint16)
     linear = np.zeros((64, 64, 3), np.float32)
-    assert np.array_equal(prepare_picture(codes16, linear, codes[..., 0]).limits, flat_picture(64, 64, codes).limits)
+    assert np.array_equal(prepare_picture(codes16, linear, codes[..., 0]).saturation,
+                          flat_picture(64, 64, codes).saturation)
 
 
 def test_trust_fades_towards_the_mask():
@@ -155,7 +156,7 @@ def test_samples_are_the_colours_behind_the_vertices():
     picture = flat_picture(linear=np.stack([u, v, 0 * u + 1], axis=-1).astype(np.float32))
     poses = nods(np.array([0.0, 25.0]), distance=450.0)
     index = np.nonzero(np.abs(ball.vertices[:, 1]) < 20)[0][::2]
-    samples = gather_samples(viewer, index, [picture, picture], poses, LENS)
+    samples = sample_points_in_frames(viewer, index, [picture, picture], poses, LENS)
     for f in range(2):
         in_camera = ball.vertices[index] @ poses[f, :3, :3].T + poses[f, :3, 3]
         pixels = 300.0 * in_camera[:, :2] / in_camera[:, 2:] + [80, 60]

@@ -12,14 +12,14 @@ from toy_result import FRAMES, INTRINSICS, SOURCE_SIZE, toy_maps, toy_mesh, toy_
 
 from shared.color import encode_srgb
 from shared.io.gltf import write_glb
-from shared.io.usd_capture import Capture, world_from_head_rigid, world_from_usd_camera
+from shared.io.usd_capture import UsdCapture, world_from_head_rigid, world_from_usd_camera
 from shared.mesh import vertex_normals
 
 NAME = '1st "Zoë" <take> / été'
 
 
 def capture(moves):
-    return Capture(toy_poses(), FRAMES, 25.0, INTRINSICS, *SOURCE_SIZE, moves)
+    return UsdCapture(toy_poses(), FRAMES, 25.0, INTRINSICS, *SOURCE_SIZE, moves)
 
 
 @pytest.fixture(params=["head", "camera"])

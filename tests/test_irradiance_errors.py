@@ -5,7 +5,7 @@ import pytest
 from shapes import grid_plane
 
 from shared.geometry import fibonacci_sphere
-from shared.irradiance_errors import irradiance_slope, irradiance_vectors, places_around, shadow_doubt
+from shared.irradiance_errors import irradiance_slope, irradiance_vectors, places_around, shadow_uncertainty
 from shared.mesh import Mesh, normalised
 from shared.raycast import RayScene
 from shared.transfer import Points, bounce_nodes, irradiance, mesh_points, trace_transfer
@@ -44,9 +44,9 @@ def inner():
 
 
 def test_a_shadow_may_end_a_little_elsewhere(wall):
-    """Over walls moved to both sides the irradiance changes as the doubt says, and nowhere else."""
+    """Over walls moved to both sides the irradiance changes as the uncertainty says, and nowhere else."""
     light, _ = lamp_light()
-    doubt = shadow_doubt(POINTS, wall, light, DIRECTIONS, REACH)[:, 0]
+    uncertainty = shadow_uncertainty(POINTS, wall, light, DIRECTIONS, REACH)[:, 0]
     here = irradiance(wall, light)[:, 0]
     steps = REACH * np.array([-1.0, -0.5, 0.5, 1.0])
     moved = [irradiance(floor_transfer(WALL_X + step), light)[:, 0] for step in steps]
@@ -54,17 +54,17 @@ def test_a_shadow_may_end_a_little_elsewhere(wall):
     border = np.abs(POINTS.positions[:, 0] - (WALL_X - WALL_HEIGHT))
     lit = np.median(here[inner() & (border > 15.0) & (POINTS.positions[:, 0] < 0.0)])
     near, far = inner() & (border < 2.0), inner() & (border > 12.0)
-    assert doubt[near].mean() > 0.1 * lit and doubt[far].max() < 0.02 * lit
-    assert 0.5 < doubt[near].mean() / change[near].mean() < 1.5
-    along = np.corrcoef(doubt[inner()], change[inner()])[0, 1]
+    assert uncertainty[near].mean() > 0.1 * lit and uncertainty[far].max() < 0.02 * lit
+    assert 0.5 < uncertainty[near].mean() / change[near].mean() < 1.5
+    along = np.corrcoef(uncertainty[inner()], change[inner()])[0, 1]
     assert along > 0.8
 
 
 def test_light_from_all_sides_casts_no_borders(wall):
     _, even = lamp_light()
-    doubt = shadow_doubt(POINTS, wall, even, DIRECTIONS, REACH)[:, 0]
+    uncertainty = shadow_uncertainty(POINTS, wall, even, DIRECTIONS, REACH)[:, 0]
     far = inner() & (POINTS.positions[:, 0] < WALL_X - 12.0)
-    assert doubt[far].max() < 0.04 * irradiance(wall, even)[far].min()
+    assert uncertainty[far].max() < 0.04 * irradiance(wall, even)[far].min()
 
 
 def test_places_lie_around_on_the_same_side():

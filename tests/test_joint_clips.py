@@ -18,7 +18,7 @@ from shared.geometry import Similarity, project, rigid, rotation_from_vector
 from shared.mesh import interpolate, vertex_normals
 from shared.solve import joint_clips
 from shared.solve.joint_clips import join_clips
-from shared.texture_match import Matches, MeanTexture, match_textures
+from shared.texture_match import ClipTexture, Matches, match_textures
 
 LENS = np.array([[900.0, 0, 128], [0, 900.0, 128], [0, 0, 1]])
 HEAD = toy_head(4).mesh(np.zeros(2), np.zeros(1))
@@ -49,7 +49,7 @@ def toy_clip(frames, widest, error_px, seed, second=False):
     return SimpleNamespace(
         mesh=mesh, camera_from_head=poses, intrinsics=LENS, size=(256, 256), moves="head", face_segment=None,
         segment_names=(), frames=SimpleNamespace(source_name="clip.avi"), tracks=(points, np.full(400, error_px)),
-        picture=lambda f: (seed, f), chart_sights=lambda: ())
+        picture=lambda f: (seed, f), chart_observations=lambda: ())
 
 
 def test_poses_come_into_the_head_space_of_the_clip_that_knows_depth_best(monkeypatch):
@@ -94,16 +94,16 @@ def test_mean_textures_show_the_same_skin_where_they_are_shifted():
     lit = moved * np.linspace(0.3, 1.2, size)[:, None]
     weight = np.full((size, size), 5.0)
     weight[:, 150:] = 0.0
-    textures = [MeanTexture(plane, np.repeat(image[..., None], 3, 2), weight) for image in (skin, lit)]
+    textures = [ClipTexture(plane, np.repeat(image[..., None], 3, 2), weight) for image in (skin, lit)]
     found = match_textures(*textures)
     here, there = found.first, found.second
     assert 0.5 * size * 150 < len(here) <= size * 150
     texel = np.ptp(plane.vertices, axis=0).max() / size
     assert np.median(np.linalg.norm(there - here, axis=1)) == pytest.approx(2.5 * texel, rel=0.1)
-    blind = MeanTexture(plane, textures[1].mean, np.zeros((size, size)))
+    blind = ClipTexture(plane, textures[1].mean, np.zeros((size, size)))
     assert len(match_textures(textures[0], blind)) == 0
     other = cv2.GaussianBlur(np.random.default_rng(5).normal(size=(size, size)), (0, 0), 2.0)
-    stranger = MeanTexture(plane, np.repeat(0.3 * np.exp(1.5 * other)[..., None], 3, 2), weight)
+    stranger = ClipTexture(plane, np.repeat(0.3 * np.exp(1.5 * other)[..., None], 3, 2), weight)
     assert len(match_textures(textures[0], stranger)) < 0.1 * len(here)
 
 
@@ -117,15 +117,15 @@ def test_given_meshes_share_a_head_space_already():
 
 
 def test_the_chart_of_the_first_clip_that_shows_one_counts():
-    from shared.chart import ChartSight
+    from shared.chart import ChartObservation
 
     clips = [toy_clip(4, 0.3, 0.1, seed) for seed in range(3)]
-    sight = ChartSight(*(np.zeros(1) for _ in range(5)), frame=2, frame_index=7)
+    observation = ChartObservation(*(np.zeros(1) for _ in range(5)), frame=2, frame_index=7)
     for clip in clips[1:]:
-        clip.chart_sights = lambda: (sight,)
+        clip.chart_observations = lambda: (observation,)
     for clip in clips:
         clip.tracks = None
-    (found,) = join_clips(clips, ()).chart_sights()
+    (found,) = join_clips(clips, ()).chart_observations()
     assert (found.frame, found.frame_index) == (6, 7)
 
 

@@ -11,17 +11,17 @@ from shared.envmap import cube_directions, frame_lookup
 from shared.geometry import rotation_from_vector
 from shared.mesh import normalised
 from shared.shading import light_along
-from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.appearance import AppearanceSettings, AppearanceSolver
 from shared.solve.capture import hold_out, spread_frames
 from shared.solve.fit_appearance import fit_appearance
 from shared.solve.light import LightPriors
 from shared.solve.light_models import make_light_model
 from shared.solve.light_step import LightStep
 from shared.solve.light_trust import weigh_samples
-from shared.solve.scale import scale_prior, settle_scale
+from shared.solve.scale import resolve_scale, scale_prior
 from shared.solve.texture import CORRELATED_FRAMES, Noise, NormalEquations, weigh_lights
 
-SETTINGS = Settings(resolutions=(8,), steps=12, noise=(0.003, 0.01), local_roughness=False)
+SETTINGS = AppearanceSettings(resolutions=(8,), steps=12, noise=(0.003, 0.01), local_roughness=False)
 
 
 def hard_lamp(directions):
@@ -33,7 +33,7 @@ def hard_lamp(directions):
 def frames_of(capture, chosen):
     """The capture with some of its frames, all in one light."""
     samples = capture.samples
-    parts = (samples.colours, samples.weight, samples.limits, samples.towards_camera)
+    parts = (samples.colours, samples.weight, samples.saturation, samples.towards_camera)
     samples = type(samples)(*(part[:, chosen] for part in parts))
     return replace(capture, samples=samples, world_from_head=capture.world_from_head[chosen],
                    fitted=capture.fitted[chosen], light_index=None)
@@ -120,8 +120,8 @@ def test_samples_count_by_how_well_their_light_knows_the_point(pair):
     plain = solver.precision.clone()
     for _ in range(8):
         step = LightStep(solver)
-        step.take()
-        step.settle()
+        step.update()
+        step.resolve_scale()
         trust = weigh_samples(solver, step.irradiance, solver.model(step.irradiance, step.reflection))
     assert max(trust) == 1.0 and min(trust) > 0.0
     lamp, sky = solver.reliability[..., 0], solver.reliability[..., -1]
@@ -158,12 +158,12 @@ def test_each_light_is_expected_to_be_white_by_itself():
     """A warm and a cold light, as far from white as each other: the albedo is that of the neutral one in between."""
     radiance = np.log([0.2, 0.12, 0.08])
     warm = np.array([[0.3, 0.0, -0.3], [-0.3, 0.0, 0.3]])
-    plain, mixed = (settle_scale(radiance, np.zeros(3), None, (0.7, 0.25), relative_light=relative)[0]
+    plain, mixed = (resolve_scale(radiance, np.zeros(3), None, (0.7, 0.25), relative_light=relative)[0]
                     for relative in (np.zeros((2, 3)), warm))
     assert np.allclose(plain, mixed, atol=1e-9)
     rows = [len(scale_prior(radiance, relative_light=np.zeros((count, 3)))[0]) for count in (1, 3)]
     assert rows == [5, 9]
-    leaning, level = (settle_scale(radiance, np.zeros(3), None, (0.7, 0.25), relative_light=relative)[0]
+    leaning, level = (resolve_scale(radiance, np.zeros(3), None, (0.7, 0.25), relative_light=relative)[0]
                       for relative in (warm[:1], np.zeros((1, 3))))
     assert leaning[2] - leaning[0] > level[2] - level[0] + 0.1
 

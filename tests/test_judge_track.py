@@ -9,7 +9,7 @@ import pytest
 from shared.contract.fields import below, field_faults
 from shared.contract.records import TRACKING
 from shared.geometry import rigid, rotation_from_vector, rotation_range_deg
-from shared.solve.judge_track import judge_frames, mouth_ratio, warnings_of
+from shared.solve.judge_track import frames_that_fit, mouth_ratio, warnings_of
 from shared.solve.track_head import HeadTrack
 from stages.track_landmarks import excluded_frames
 
@@ -53,7 +53,7 @@ def warnings(track, fits=EVERY_FRAME, frame_count=FRAMES, focal_known=True):
 
 def test_good_clip_has_neither_reasons_nor_warnings():
     track = good_track()
-    fits, reasons = judge_frames(track, 4.0)
+    fits, reasons = frames_that_fit(track, 4.0)
     assert fits.all() and reasons == [""] * FRAMES
     assert warnings(track) == []
 
@@ -77,7 +77,7 @@ def test_frame_with_too_few_tracks_is_named():
     reliable = np.arange(FRAMES) != 3
     error = good_track().error_px
     error[3] = np.nan
-    fits, reasons = judge_frames(good_track(reliable=reliable, error_px=error), 4.0)
+    fits, reasons = frames_that_fit(good_track(reliable=reliable, error_px=error), 4.0)
     assert np.array_equal(fits, reliable)
     assert reasons[3] == "too little skin could be tracked" and reasons[2] == ""
 
@@ -86,7 +86,7 @@ def test_frame_that_fits_badly_is_named():
     error = good_track().error_px
     error[7] += 2.0
     error[8] += 0.3  # more than the others, less than the limit
-    fits, reasons = judge_frames(good_track(error_px=error), 4.0)
+    fits, reasons = frames_that_fit(good_track(error_px=error), 4.0)
     assert np.nonzero(~fits)[0].tolist() == [7]
     assert reasons[7].startswith("track error 2.1") and "blur" in reasons[7]
 
@@ -96,7 +96,7 @@ def test_limit_grows_with_the_clip_s_own_error():
     error = track.error_px.copy()
     error[7] *= 3
     error[8] *= 6
-    fits, _ = judge_frames(replace(track, error_px=error), 4.0)
+    fits, _ = frames_that_fit(replace(track, error_px=error), 4.0)
     assert np.nonzero(~fits)[0].tolist() == [8]
 
 

@@ -1,4 +1,5 @@
-"""The ladder of models: the rule by which a rung is climbed, and where it ends on captures whose truth is known."""
+"""Model selection: the rule by which a candidate is accepted, and where it ends on captures whose truth is
+known."""
 
 import json
 from dataclasses import replace
@@ -21,60 +22,60 @@ from shared.contract.fields import below, field_faults
 from shared.contract.job import Parameters
 from shared.contract.records import LADDER_TIMES, RUN, SOLVE
 from shared.errors import InputError
-from shared.report.gather import ladder_record
-from shared.report.model_sections import climbed_table
+from shared.report.gather import selection_record
+from shared.report.model_sections import selection_table
 from shared.solve import ladder_clip
-from shared.solve.appearance import Settings
+from shared.solve.appearance import AppearanceSettings
 from shared.solve.fit_appearance import Solution
 from shared.solve.inverse_parameters import read_forced, read_settings
 from shared.solve.inverse_problem import InverseSettings
-from shared.solve.ladder import LIGHTS, Ladder, Model, Trial, allowed_rungs, gain, serves
-from shared.solve.ladder_clip import climb
-from shared.solve.ladder_gloss import VARIATIONS, Gloss, GlossLadder, segments_at
+from shared.solve.ladder import LIGHTS, Model, ModelSelection, Trial, allowed_candidates, gain, serves
+from shared.solve.ladder_clip import select
+from shared.solve.ladder_gloss import VARIATIONS, SpecularSelection, SpecularVariation, segments_at
 from shared.solve.shape import ShapeSettings
 from stages.inverse_render import STAGE
 
-CAREFUL = Settings(resolutions=(8, 16), noise=(0.003, 0.01))
+CAREFUL = AppearanceSettings(resolutions=(8, 16), noise=(0.003, 0.01))
 
 
-def climbed(capture, settings=CAREFUL, **rungs):
-    """The ladder and the record of its rungs; visibility off would need a transfer of its own."""
+def selected(capture, settings=CAREFUL, **candidates):
+    """Model selection and the record of its candidates; visibility off would need a transfer of its own."""
     records = []
-    allowed = allowed_rungs(settings) | {"visibility": ("on", "bounces")} | rungs
-    ladder = Ladder({True: capture}, settings, allowed, records.append)
-    ladder.climb()
-    return ladder, records
+    allowed = allowed_candidates(settings) | {"visibility": ("on", "bounces")} | candidates
+    selection = ModelSelection({True: capture}, settings, allowed, records.append)
+    selection.select()
+    return selection, records
 
 
 @pytest.fixture(scope="module")
 def matte(one_thread):
-    return climbed(make_truth(specular=0.0, lights=(even_light,))[0])
+    return selected(make_truth(specular=0.0, lights=(even_light,))[0])
 
 
 @pytest.fixture(scope="module")
 def glossy(one_thread):
     """Glossy enough that highlights save three of their standard errors: a gain of one hangs on roundings."""
-    return climbed(make_truth(specular=1.0, lights=(hard_light,))[0])
+    return selected(make_truth(specular=1.0, lights=(hard_light,))[0])
 
 
 def test_a_matte_evenly_lit_head_ends_low(matte):
-    ladder, records = matte
-    assert ladder.present.model.specular == "none"
-    assert ladder.present.model.light == "harmonics_2"
+    selection, records = matte
+    assert selection.present.model.specular == "none"
+    assert selection.present.model.light == "harmonics_2"
     refused = {record["rung"] for record in records if not record["climbed"]}
     assert {"one_value", "sun_sky", "harmonics_4"} <= refused
-    assert ladder.present.errors.mean() < 1.5 * NOISE
+    assert selection.present.errors.mean() < 1.5 * NOISE
 
 
-def test_a_glossy_hard_lit_head_climbs(glossy):
-    ladder, records = glossy
-    assert ladder.present.model.specular == "one_value"
-    assert list(LIGHTS).index(ladder.present.model.light) > list(LIGHTS).index("harmonics_2")
-    assert ladder.present.errors.mean() < 0.5 * records[0]["held_out"]
+def test_a_glossy_hard_lit_head_needs_more(glossy):
+    selection, records = glossy
+    assert selection.present.model.specular == "one_value"
+    assert list(LIGHTS).index(selection.present.model.light) > list(LIGHTS).index("harmonics_2")
+    assert selection.present.errors.mean() < 0.5 * records[0]["held_out"]
 
 
-def test_every_rung_is_on_the_record_with_its_error_and_seconds(glossy):
-    ladder, records = glossy
+def test_every_candidate_is_on_the_record_with_its_error_and_seconds(glossy):
+    selection, records = glossy
     assert records[0]["part"] == "start" and records[0]["fall"] is None
     held_out = records[0]["held_out"]
     for record in records[1:]:
@@ -83,30 +84,30 @@ def test_every_rung_is_on_the_record_with_its_error_and_seconds(glossy):
         assert record["climbed"] == (record["fall"] > max(record["standard_error"], worthwhile))
         assert record["seconds"] > 0.0
         held_out = record["held_out"] if record["climbed"] else held_out
-    assert held_out == pytest.approx(float(ladder.present.errors.mean()))
-    assert len(ladder.tried) == len(records)  # no model twice
+    assert held_out == pytest.approx(float(selection.present.errors.mean()))
+    assert len(selection.tried) == len(records)  # no model twice
 
 
-def gloss_of(capture, segment, **rungs):
-    """The variation of gloss that is climbed to under the true light, and the record."""
+def variation_of(capture, segment, **candidates):
+    """The variation of specular terms that is selected under the true light, and the record."""
     model, records = Model("bounces", "one_value", "cubemap_16"), []
-    settings = model.applied(Settings(noise=(0.003, 0.01), roughness=ROUGHNESS))
+    settings = model.applied(AppearanceSettings(noise=(0.003, 0.01), roughness=ROUGHNESS))
     state = solver_under_true_light(capture).state
     trial = Trial(model, Solution(state, (), 0.0, 0.0), np.zeros(0), 0.0)
-    allowed = {"specular": VARIATIONS, "roughness": VARIATIONS} | rungs
-    return GlossLadder(capture, settings, trial, segment, allowed, records.append).climb(), records
+    allowed = {"specular": VARIATIONS, "roughness": VARIATIONS} | candidates
+    return SpecularSelection(capture, settings, trial, segment, allowed, records.append).select(), records
 
 
 def test_gloss_that_differs_by_segment_is_found_and_worn(one_thread):
     capture = make_truth(roughness_at=glossy_forehead)[0]
     height = capture.points.positions[:, 1]
     forehead = (height > np.median(height)).astype(int)
-    gloss, records = gloss_of(capture, forehead, specular=("one_value",))
-    assert gloss.roughness == "by_segment" and gloss.specular == "one_value"
+    variation, records = variation_of(capture, forehead, specular=("one_value",))
+    assert variation.roughness == "by_segment" and variation.specular == "one_value"
     assert [record["rung"] for record in records] == ["by_segment", "local"]
     solution = Solution(solver_under_true_light(capture).state, (), 0.0, 0.0)
-    worn = gloss.worn_by(replace(solution, state=replace(solution.state, roughness=1.1 * ROUGHNESS)))
-    found = worn.gloss.roughness(capture.points.positions)
+    worn = variation.worn_by(replace(solution, state=replace(solution.state, roughness=1.1 * ROUGHNESS)))
+    found = worn.local_roughness_fit.roughness(capture.points.positions)
     assert len(np.unique(found.round(9))) == 2 and worn.local_specular is None
     assert found[forehead == 1].mean() < 0.93 * 1.1 * ROUGHNESS < 1.05 * 1.1 * ROUGHNESS < found[forehead == 0].mean()
 
@@ -114,9 +115,9 @@ def test_gloss_that_differs_by_segment_is_found_and_worn(one_thread):
 def test_one_gloss_everywhere_stays_one(one_thread):
     capture = make_truth()[0]
     segment = (capture.points.positions[:, 0] > 0.0).astype(int)
-    gloss, records = gloss_of(capture, segment)
-    assert gloss == Gloss() and len(records) == 4
-    assert gloss.worn_by(Solution(None, (), 0.0, 0.0)).gloss is None
+    variation, records = variation_of(capture, segment)
+    assert variation == SpecularVariation() and len(records) == 4
+    assert variation.worn_by(Solution(None, (), 0.0, 0.0)).local_roughness_fit is None
 
 
 def test_points_take_the_segment_of_the_surface_next_to_them():
@@ -127,10 +128,10 @@ def test_points_take_the_segment_of_the_surface_next_to_them():
     assert segments_at(mesh, None, mesh.vertices) is None
 
 
-def test_a_ladder_goes_on_where_it_stands(glossy):
-    ladder, records = glossy
-    before, count = ladder.present, len(records)
-    assert ladder.climb() is before and len(records) == count
+def test_a_selection_goes_on_where_it_stands(glossy):
+    selection, records = glossy
+    before, count = selection.present, len(records)
+    assert selection.select() is before and len(records) == count
 
 
 @pytest.mark.parametrize("alone", [False, True])
@@ -143,8 +144,9 @@ def test_where_shadows_do_not_serve_all_parts_are_tried_at_once(monkeypatch, alo
         error = 0.5 if model == whole else 0.7 if alone and model.visibility == "bounces" else 1.0
         return Trial(model, None, error * frames, 0.1)
 
-    monkeypatch.setattr(Ladder, "_try", lambda self, model, start: replace(tried(self, model, start), solution=start))
-    found = Ladder({}, CAREFUL, allowed_rungs(CAREFUL), records.append).climb()
+    monkeypatch.setattr(ModelSelection, "_try", lambda self, model,
+                        start: replace(tried(self, model, start), solution=start))
+    found = ModelSelection({}, CAREFUL, allowed_candidates(CAREFUL), records.append).select()
     leaps = [record for record in records if record["part"] == "leap"]
     assert len(leaps) == (not alone) and (alone or found.model == whole)
     if not alone:
@@ -152,25 +154,26 @@ def test_where_shadows_do_not_serve_all_parts_are_tried_at_once(monkeypatch, alo
         assert records[-1]["rung"] == "cubemap_16"  # and the climb goes on from there
 
 
-def tried_rungs(monkeypatch, error_of):
+def tried_candidates(monkeypatch, error_of):
     """What is tried, in order, where a model's error is as given for all frames."""
     records, frames = [], np.linspace(0.99, 1.01, 9)
-    monkeypatch.setattr(Ladder, "_try", lambda self, model, start: Trial(model, None, error_of(model) * frames, 0.1))
-    monkeypatch.setattr(Ladder, "_at_bottom", lambda self: False)
-    Ladder({}, CAREFUL, allowed_rungs(CAREFUL), records.append).climb()
+    monkeypatch.setattr(ModelSelection, "_try", lambda self, model,
+                        start: Trial(model, None, error_of(model) * frames, 0.1))
+    monkeypatch.setattr(ModelSelection, "_at_bottom", lambda self: False)
+    ModelSelection({}, CAREFUL, allowed_candidates(CAREFUL), records.append).select()
     return [(record["rung"], record["climbed"]) for record in records if record["part"] in ("light", "specular")]
 
 
 def test_harmonics_are_passed_over_once_a_sun_serves(monkeypatch):
     error = {"harmonics_2": 1.0, "sun_sky": 0.8, "harmonics_4": 0.1, "cubemap_8": 0.9, "cubemap_16": 0.9}
-    found = tried_rungs(monkeypatch, lambda model: error[model.light])
+    found = tried_candidates(monkeypatch, lambda model: error[model.light])
     assert ("sun_sky", True) in found and "harmonics_4" not in dict(found)
     assert found[1:3] == [("cubemap_8", False), ("cubemap_16", False)]
 
 
 @pytest.mark.parametrize(("saved", "worth"), [(0.01, False), (0.03, True)])
-def test_highlights_must_save_more_than_other_rungs(monkeypatch, saved, worth):
-    found = tried_rungs(monkeypatch, lambda model: 1.0 - saved * (model.specular == "one_value"))
+def test_highlights_must_save_more_than_other_candidates(monkeypatch, saved, worth):
+    found = tried_candidates(monkeypatch, lambda model: 1.0 - saved * (model.specular == "one_value"))
     assert ("one_value", worth) in found
 
 
@@ -194,26 +197,26 @@ def test_a_fall_within_its_standard_error_does_not_serve():
     assert not serves(frames, frames - 0.00002)  # all frames gain, but next to nothing
 
 
-def test_settings_bound_the_ladder_and_force_its_rungs():
-    free = allowed_rungs(Settings())
+def test_settings_bound_model_selection_and_force_its_candidates():
+    free = allowed_candidates(AppearanceSettings())
     assert free["visibility"] == ("off", "on", "bounces") and free["specular"] == ("none", "one_value")
     assert free["light"][0] == "harmonics_2" and free["light"][-1] == "cubemap_16"
-    assert allowed_rungs(Settings(bounce=False))["visibility"] == ("off", "on")
-    assert allowed_rungs(Settings(visibility=False))["visibility"] == ("off",)
-    assert allowed_rungs(Settings(specular=False))["specular"] == ("none",)
-    assert allowed_rungs(Settings(resolutions=(4,)))["light"][-2:] == ("harmonics_4", "cubemap")
-    assert allowed_rungs(Settings(light_model="sun_sky"))["light"] == ("sun_sky",)
-    assert allowed_rungs(Settings(), frozenset({"light", "specular"})) == free | {
+    assert allowed_candidates(AppearanceSettings(bounce=False))["visibility"] == ("off", "on")
+    assert allowed_candidates(AppearanceSettings(visibility=False))["visibility"] == ("off",)
+    assert allowed_candidates(AppearanceSettings(specular=False))["specular"] == ("none",)
+    assert allowed_candidates(AppearanceSettings(resolutions=(4,)))["light"][-2:] == ("harmonics_4", "cubemap")
+    assert allowed_candidates(AppearanceSettings(light_model="sun_sky"))["light"] == ("sun_sky",)
+    assert allowed_candidates(AppearanceSettings(), frozenset({"light", "specular"})) == free | {
         "light": ("cubemap_16",), "specular": ("one_value",)}
 
 
 def test_a_model_becomes_the_solvers_settings():
-    settings = Model("on", "none", "harmonics_4").applied(Settings())
+    settings = Model("on", "none", "harmonics_4").applied(AppearanceSettings())
     assert settings.visibility and not settings.bounce and not settings.specular
     assert (settings.light_model, settings.resolutions) == ("harmonics_4", (8,))
-    camera = Model("bounces", "one_value", "camera").applied(Settings(light_model="camera"))
+    camera = Model("bounces", "one_value", "camera").applied(AppearanceSettings(light_model="camera"))
     assert (camera.light_model, camera.resolutions) == ("camera", (16,))
-    coarse = Model("off", "none", "cubemap").applied(Settings(resolutions=(4,)))
+    coarse = Model("off", "none", "cubemap").applied(AppearanceSettings(resolutions=(4,)))
     assert (coarse.light_model, coarse.resolutions) == ("cubemap", (4,))
 
 
@@ -223,7 +226,7 @@ class Seen:
     def __init__(self, inputs, *_):
         self.inputs, self.sizes = inputs, None
         self.captures = {visible: inputs.capture for visible in (False, True)}
-        self.scenery = dict.fromkeys(self.captures, SimpleNamespace(nodes=None))
+        self.precomputed = dict.fromkeys(self.captures, SimpleNamespace(nodes=None))
 
 
 def noisy(capture, sigma):
@@ -231,54 +234,55 @@ def noisy(capture, sigma):
     return replace(capture, samples=replace(capture.samples, colours=colours.astype(np.float32)))
 
 
-MATTE = Settings(resolutions=(8,), light_model="harmonics_2", specular=False, noise=(0.003, 0.01))
+MATTE = AppearanceSettings(resolutions=(8,), light_model="harmonics_2", specular=False, noise=(0.003, 0.01))
 
 
 def clip_of(capture):
     return SimpleNamespace(capture=capture, mesh=None, face_segment=np.zeros(1), camera_from_head=np.zeros((14, 4, 4)))
 
 
-def climb_meshes(monkeypatch, qualities, **settings):
-    """What the clip's ladder leads to if a mesh of each number of subdivisions leaves so much noise."""
+def select_meshes(monkeypatch, qualities, **settings):
+    """What the clip's model selection leads to if a mesh of each number of subdivisions leaves so much noise."""
     capture, asked = make_truth(specular=0.0)[0], []
 
-    def reshape(tracked, frames, known, appearance, sizes, shape, progress, note, begun):
+    def refine_shape(tracked, frames, known, appearance, sizes, shape, progress, note, begun):
         asked.append((shape.subdivisions, begun and begun.mesh))
         return SimpleNamespace(**{**vars(tracked), "capture": noisy(capture, qualities[1 + shape.subdivisions]),
                                   "mesh": f"level {shape.subdivisions}", "stopped": 3 + shape.subdivisions})
 
     monkeypatch.setattr(ladder_clip, "SmallClip", Seen)
-    monkeypatch.setattr(ladder_clip, "reshape", reshape)
+    monkeypatch.setattr(ladder_clip, "refine_shape", refine_shape)
     monkeypatch.setattr(ladder_clip, "frames_of", lambda *_: None)
-    whole = InverseSettings(appearance=MATTE, ladder=frozenset(), shape=ShapeSettings(subdivisions=1), **settings)
+    whole = InverseSettings(appearance=MATTE, selection=frozenset(), shape=ShapeSettings(subdivisions=1), **settings)
     fitted = np.ones(14, bool)
-    return climb(clip_of(noisy(capture, qualities[0])), whole, fitted, None, None, lambda text: None), asked
+    return select(clip_of(noisy(capture, qualities[0])), whole, fitted, None, None, lambda text: None), asked
 
 
 def test_the_mesh_is_refined_as_far_as_it_serves(one_thread, monkeypatch):
-    climbed, asked = climb_meshes(monkeypatch, (0.02, 0.005, 0.02))
-    assert climbed.inputs.mesh == "level 0" and climbed.settings.shape is None
+    selected, asked = select_meshes(monkeypatch, (0.02, 0.005, 0.02))
+    assert selected.inputs.mesh == "level 0" and selected.settings.shape is None
     assert asked == [(0, None), (1, "level 0")]  # the second goes on where the first ended
-    assert climbed.shape_record["refined"] and climbed.shape_record["stopped_vertices"] == 3
-    assert climbed.shape_record["held_out"]["after"] < 0.5 * climbed.shape_record["held_out"]["before"]
-    meshes = [(rung["rung"], rung["climbed"]) for rung in climbed.rungs if rung["part"] == "geometry"]
+    assert selected.shape_record["refined"] and selected.shape_record["stopped_vertices"] == 3
+    assert selected.shape_record["held_out"]["after"] < 0.5 * selected.shape_record["held_out"]["before"]
+    meshes = [(candidate["rung"],
+               candidate["climbed"]) for candidate in selected.candidates if candidate["part"] == "geometry"]
     assert meshes == [("refined", True), ("subdivided_1", False)]
-    assert climbed.settings.appearance.specular is False and climbed.start.held_out > 0.0
+    assert selected.settings.appearance.specular is False and selected.start.held_out > 0.0
 
 
 def test_a_tracked_mesh_that_no_refinement_improves_stays(one_thread, monkeypatch):
-    climbed, asked = climb_meshes(monkeypatch, (0.01, 0.01, 0.005))
-    assert climbed.inputs.mesh is None and climbed.shape_record == {"refined": False}
+    selected, asked = select_meshes(monkeypatch, (0.01, 0.01, 0.005))
+    assert selected.inputs.mesh is None and selected.shape_record == {"refined": False}
     assert asked == [(0, None)]
 
 
 def test_too_few_held_out_frames_choose_no_model(one_thread, monkeypatch):
     capture = make_truth(specular=0.0)[0]
     monkeypatch.setattr(ladder_clip, "SmallClip", Seen)
-    notes, whole = [], InverseSettings(appearance=MATTE, ladder=frozenset())
+    notes, whole = [], InverseSettings(appearance=MATTE, selection=frozenset())
     two = clip_of(replace(capture, fitted=np.arange(14) > 1))
-    climbed = climb(two, whole, np.ones(14, bool), None, None, notes.append)
-    assert climbed.start is None and climbed.rungs == () and climbed.settings == replace(whole, ladder=None)
+    selected = select(two, whole, np.ones(14, bool), None, None, notes.append)
+    assert selected.start is None and selected.candidates == () and selected.settings == replace(whole, selection=None)
     assert "2 frames are too few" in notes[0]
 
 
@@ -287,10 +291,10 @@ def told(**changes):
     return Parameters({**STAGE.defaults(), **STAGE.parse(changes, "test")})
 
 
-def test_the_stage_climbs_only_when_told_to():
-    assert read_settings(told()).ladder is None
-    assert read_settings(told(model="auto")).ladder == frozenset()
-    assert read_settings(told(model="auto", forced="light, geometry")).ladder == {"light", "geometry"}
+def test_the_stage_selects_only_when_told_to():
+    assert read_settings(told()).selection is None
+    assert read_settings(told(model="auto")).selection == frozenset()
+    assert read_settings(told(model="auto", fixed_parts="light, geometry")).selection == {"light", "geometry"}
 
 
 def test_forcing_what_there_is_not_is_one_clear_line():
@@ -300,15 +304,15 @@ def test_forcing_what_there_is_not_is_one_clear_line():
         read_settings(told(model="auto", solver="reference"))
 
 
-def test_the_ladder_reaches_run_json_and_the_report(glossy, tmp_path):
+def test_model_selection_reaches_run_json_and_the_report(glossy, tmp_path):
     _, records = glossy
-    rungs = [dict(record) for record in records]
-    seconds = [rung.pop("seconds") for rung in rungs]
+    candidates = [dict(record) for record in records]
+    seconds = [candidate.pop("seconds") for candidate in candidates]
     (tmp_path / "ladder_seconds.json").write_text(json.dumps(seconds))
-    merged = ladder_record(tmp_path, {"ladder": rungs})
+    merged = selection_record(tmp_path, {"ladder": candidates})
     assert field_faults(seconds, LADDER_TIMES) == []
-    assert [field_faults(rung, below(SOLVE, "ladder[]")) for rung in rungs] == [[]] * len(rungs)
-    assert [field_faults(rung, below(RUN, "ladder[]")) for rung in merged] == [[]] * len(rungs)
+    assert [field_faults(candidate, below(SOLVE, "ladder[]")) for candidate in candidates] == [[]] * len(candidates)
+    assert [field_faults(candidate, below(RUN, "ladder[]")) for candidate in merged] == [[]] * len(candidates)
     assert merged == [dict(record) for record in records]
-    page = climbed_table(merged)
+    page = selection_table(merged)
     assert page.count("<tr>") == 1 + len(records) and "harmonics 2" in page

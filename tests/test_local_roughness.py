@@ -5,7 +5,7 @@ import pytest
 from toy_capture import ROUGHNESS, SPECULAR, glossy_forehead, make_truth, solver_under_true_light
 
 from shared.solve import local_roughness as module
-from shared.solve.local_roughness import GlossEquations, local_roughness
+from shared.solve.local_roughness import SpecularEquations, local_roughness
 
 LOGS = np.log(ROUGHNESS) + np.log(module.FACTOR) * np.arange(-module.STEPS, module.STEPS + 1)
 
@@ -32,7 +32,7 @@ def test_far_from_any_highlight_the_clips_value_stands():
     """One point whose samples say half a step down: around it that, further away the prior."""
     moment = np.full((len(LOGS), 1), 100.0)
     moment[module.STEPS - 1] += 40.0
-    equations = GlossEquations(np.zeros((1, 3)), LOGS, np.full((len(LOGS), 1), 100.0), moment, (SPECULAR, 30.0))
+    equations = SpecularEquations(np.zeros((1, 3)), LOGS, np.full((len(LOGS), 1), 100.0), moment, (SPECULAR, 30.0))
     at = np.array([[0.0, 0, 0], [0.7 * module.REACH * module.WIDTH_MM, 0, 0], [200.0, 0, 0]])
     near, fading, far = equations.roughness(at)
     assert near < fading < far

@@ -11,10 +11,10 @@ import pytest
 from toy_runs import CURRENT_STAGES, copy_pipeline, limn, limn_process, make_subject, tree
 
 from shared.contract import launch
-from shared.contract.needs import Scale, amount, measured_scale, parse_needs
+from shared.contract.needs import WorkSize, amount, measured_scale, parse_needs
 from shared.contract.pipeline import Gate
 from shared.errors import InputError
-from tools.booking import booked, memory_to_give
+from tools.booking import memory_to_give, requested
 from tools.cases import find_subjects
 from tools.limn import main
 
@@ -166,15 +166,15 @@ def test_gates_of_a_real_result(tiny_run, tmp_path):
 
 def test_needs_grow_with_the_work(tmp_path):
     needs = parse_needs({"mem_mb": {"base": 100, "frame": 1, "frame_megapixel": 2, "map_megapixel": 50}}, "here")
-    large = Scale(frames=200, crop_px=1000, map_px=2000)
+    large = WorkSize(frames=200, crop_px=1000, map_px=2000)
     assert amount(needs, "mem_mb", large) == 100 + 200 + 400 + 200 and amount(needs, "runtime", large) is None
     scale = {"frames": 200, "crop_px": 1000, "map_px": 2000}
-    assert [booked(needs, "mem_mb", scale, tmp_path, attempt, None) for attempt in (1, 2)] == [900, 1800]
-    assert booked(needs, "mem_mb", scale, tmp_path, 2, 1000) == 1000
+    assert [requested(needs, "mem_mb", scale, tmp_path, attempt, None) for attempt in (1, 2)] == [900, 1800]
+    assert requested(needs, "mem_mb", scale, tmp_path, 2, 1000) == 1000
     folder = tmp_path / "work" / "sample_frames"
     folder.mkdir(parents=True)
     (folder / "frames.json").write_text(json.dumps({"size": [400, 900], "frames": [{}] * 50}))
-    assert measured_scale(tmp_path, large) == Scale(50, 600.0, 2000)
+    assert measured_scale(tmp_path, large) == WorkSize(50, 600.0, 2000)
     with pytest.raises(InputError, match="did you mean frame?"):
         parse_needs({"mem_mb": {"fame": 1}}, "here")
     assert memory_to_give() > 100

@@ -11,7 +11,7 @@ from shared.errors import InputError
 from shared.mesh import face_normals
 from shared.solve.capture import Sizes
 from shared.studio_lights import studio_light
-from tools.bench_shading import SKIN, Stage, compare, head
+from tools.bench_shading import SKIN, TracedView, compare, head
 from tools.peer_mitsuba import ALL_BOUNCES, DIRECT, ONE_BOUNCE, Coat, path_trace
 from tools.statue import statue
 
@@ -28,13 +28,13 @@ def stage(request):
         mesh = head() if request.param == "head" else statue(5)
     except InputError as error:
         pytest.skip(str(error))
-    return Stage.of(mesh, studio_light("window"), PIXELS, Sizes(directions=768, nodes=600))
+    return TracedView.of(mesh, studio_light("window"), PIXELS, Sizes(directions=768, nodes=600))
 
 
 def test_both_renderers_agree_on_conventions():
     """A ball under even light and a lamp on one side: place, sides and the BSDF's energy."""
     ball = sphere(80.0, 4)
-    stage = Stage.of(ball, studio_light("low_sun"), 32, Sizes(directions=768, nodes=50))
+    stage = TracedView.of(ball, studio_light("low_sun"), 32, Sizes(directions=768, nodes=50))
     theirs = stage.truth(Coat(SKIN), DIRECT, 512)
     found = compare(stage.diffuse(SKIN, 0), theirs, stage.filled())
     assert abs(found["mean"]) < 0.01 and found["rms"] < 0.03

@@ -7,7 +7,7 @@ from tools import test_all as optional
 
 def part(folder, script, name="Teapot"):
     """A part that is there once folder/done is."""
-    return optional.Part(name, (folder / "done").exists, ((sys.executable, "-c", script),))
+    return optional.OptionalPart(name, (folder / "done").exists, ((sys.executable, "-c", script),))
 
 
 def test_installed_once(tmp_path):
@@ -18,7 +18,7 @@ def test_installed_once(tmp_path):
 
 def test_failures_are_named(tmp_path, monkeypatch):
     monkeypatch.setattr(optional.shutil, "which", lambda name: None)
-    absent = optional.Part("Kettle", (tmp_path / "done").exists, (("no-such-program-of-limn",),))
+    absent = optional.OptionalPart("Kettle", (tmp_path / "done").exists, (("no-such-program-of-limn",),))
     monkeypatch.setattr(optional, "PARTS", (
         part(tmp_path, "raise SystemExit('E: no package teapot')"), part(tmp_path, "pass", "Cup"), absent))
     teapot, cup, kettle = optional.failures()

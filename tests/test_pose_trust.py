@@ -12,10 +12,10 @@ from shared.solve.focal_search import farther
 from shared.solve.pose_trust import (
     FOCAL_DEVIATIONS,
     SHARED_ERRORS,
+    estimate_uncertainty,
     focal_elsewhere,
     noise_factor,
     rotations_apart,
-    trust,
 )
 from shared.solve.tracked_clip import TrackedClip
 
@@ -104,13 +104,13 @@ def test_rotations_apart_in_camera_axes():
 @pytest.mark.parametrize("shared_mm", [0.0, 12.0])
 def test_covariance_covers_the_true_errors(shared_mm):
     tracks, solution = solved(shared_mm, seed=3)
-    trusted = trust(clip_of(), all_reliable(tracks, solution), PRIOR_MM, estimate_focal=False)
-    error = rotations_apart(trusted.adjusted.solution.camera_from_points[:, :3, :3], turn()[:, :3, :3])
-    inverse = np.linalg.inv(trusted.covariance[:, :3, :3])
+    estimated = estimate_uncertainty(clip_of(), all_reliable(tracks, solution), PRIOR_MM, estimate_focal=False)
+    error = rotations_apart(estimated.adjusted.solution.camera_from_points[:, :3, :3], turn()[:, :3, :3])
+    inverse = np.linalg.inv(estimated.covariance[:, :3, :3])
     distance = np.einsum("fi,fij,fj->f", error, inverse, error)
     assert (distance < CHI_SQUARED_90_3).mean() >= 0.8
     assert np.median(distance) > 0.2  # nor are they promised to be far worse than they are
-    assert trusted.noise_factor >= SHARED_ERRORS and not trusted.focal_solved
+    assert estimated.noise_factor >= SHARED_ERRORS and not estimated.focal_solved
 
 
 def test_frames_that_are_not_reliable_have_no_covariance():
@@ -119,19 +119,19 @@ def test_frames_that_are_not_reliable_have_no_covariance():
     poses = np.array(solution.camera_from_points)
     poses[5] = poses[0]
     lost = BundleSolution(poses, solution.points, solution.residuals_px)
-    trusted = trust(clip_of(), Adjusted(lost, tracks, reliable), PRIOR_MM, estimate_focal=False)
-    assert np.isnan(trusted.covariance[5]).all() and np.isfinite(trusted.covariance[reliable]).all()
-    assert np.linalg.eigvalsh(trusted.covariance[reliable]).min() > -1e-12
-    assert np.array_equal(trusted.adjusted.solution.camera_from_points[5], poses[5])
-    assert np.isnan(trusted.adjusted.solution.error_px[5]).all()
+    estimated = estimate_uncertainty(clip_of(), Adjusted(lost, tracks, reliable), PRIOR_MM, estimate_focal=False)
+    assert np.isnan(estimated.covariance[5]).all() and np.isfinite(estimated.covariance[reliable]).all()
+    assert np.linalg.eigvalsh(estimated.covariance[reliable]).min() > -1e-12
+    assert np.array_equal(estimated.adjusted.solution.camera_from_points[5], poses[5])
+    assert np.isnan(estimated.adjusted.solution.error_px[5]).all()
 
 
 def test_guessed_focal_length_is_solved_and_a_given_one_only_checked():
     wrong = zoomed(LENS, 1.06)
     tracks, solution = solved(lens=wrong)
     last = all_reliable(tracks, solution)
-    guessed = trust(clip_of(wrong), last, PRIOR_MM, estimate_focal=True)
-    given = trust(clip_of(wrong), last, PRIOR_MM, estimate_focal=False)
+    guessed = estimate_uncertainty(clip_of(wrong), last, PRIOR_MM, estimate_focal=True)
+    given = estimate_uncertainty(clip_of(wrong), last, PRIOR_MM, estimate_focal=False)
     assert guessed.focal_solved and not given.focal_solved
     assert guessed.focal_gain == given.focal_gain == pytest.approx(1 / 1.06, rel=0.02)
     assert abs(np.log(guessed.focal_gain * 1.06)) < 3 * guessed.focal_deviation
@@ -148,9 +148,9 @@ def test_focal_length_is_found_however_wrong_the_given_one_is(wrong):
     solution = adjust(tracks, start, cloud, lens, loss_scale=LOSS, prior_mm=1000.0, max_iterations=100)
     last = all_reliable(tracks, solution)
     elsewhere = focal_elsewhere(clip_of(lens), last)
-    trusted = trust(clip_of(lens), last, 10.0, False, elsewhere)
-    assert abs(np.log(trusted.focal_gain * wrong)) < 0.15
-    assert abs(np.log(trusted.focal_gain)) > FOCAL_DEVIATIONS * trusted.focal_deviation  # so that a warning says it
+    estimated = estimate_uncertainty(clip_of(lens), last, 10.0, False, elsewhere)
+    assert abs(np.log(estimated.focal_gain * wrong)) < 0.15
+    assert abs(np.log(estimated.focal_gain)) > FOCAL_DEVIATIONS * estimated.focal_deviation  # so that a warning says it
 
 
 @pytest.mark.parametrize("prior_mm", [10.0, 30.0])
@@ -158,17 +158,18 @@ def test_right_focal_length_is_left_alone(prior_mm):
     tracks, solution = solved(12.0, seed=4)
     last = all_reliable(tracks, solution)
     assert focal_elsewhere(clip_of(), last) is None
-    trusted = trust(clip_of(), last, prior_mm, estimate_focal=False)
-    assert abs(np.log(trusted.focal_gain)) < 3 * trusted.focal_deviation
+    estimated = estimate_uncertainty(clip_of(), last, prior_mm, estimate_focal=False)
+    assert abs(np.log(estimated.focal_gain)) < 3 * estimated.focal_deviation
 
 
 def test_held_poses_stay():
     tracks, solution = solved()
     held = BundleSolution(turn(), solution.points, solution.residuals_px)
-    trusted = trust(clip_of(hold_poses=True), all_reliable(tracks, held), PRIOR_MM, estimate_focal=True)
-    assert np.array_equal(trusted.adjusted.solution.camera_from_points, turn())
-    assert not trusted.focal_solved and np.isfinite(trusted.covariance).all()
-    off, known = trusted.held_off
+    estimated = estimate_uncertainty(clip_of(hold_poses=True), all_reliable(tracks, held), PRIOR_MM,
+                                     estimate_focal=True)
+    assert np.array_equal(estimated.adjusted.solution.camera_from_points, turn())
+    assert not estimated.focal_solved and np.isfinite(estimated.covariance).all()
+    off, known = estimated.held_off
     assert off < 3 * known < np.radians(0.3)
 
 
@@ -178,9 +179,9 @@ def test_held_poses_that_the_tracks_contradict_are_uncertain_by_as_much():
     wrong = np.array(turn())
     wrong[:, :3, :3] = wrong[:, :3, :3] @ rotation_from_vector(errors)
     held = all_reliable(tracks, BundleSolution(wrong, solution.points, solution.residuals_px))
-    trusted = trust(clip_of(hold_poses=True), held, PRIOR_MM, estimate_focal=False)
-    off, known = trusted.held_off
+    estimated = estimate_uncertainty(clip_of(hold_poses=True), held, PRIOR_MM, estimate_focal=False)
+    off, known = estimated.held_off
     assert off == pytest.approx(np.sqrt((errors**2).sum(1).mean()), rel=0.15) and off > 3 * known
-    deviation = np.sqrt(np.trace(trusted.covariance[:, :3, :3], axis1=1, axis2=2))
+    deviation = np.sqrt(np.trace(estimated.covariance[:, :3, :3], axis1=1, axis2=2))
     assert np.corrcoef(deviation, np.linalg.norm(errors, axis=1))[0, 1] > 0.9
-    assert trust(clip_of(), held, PRIOR_MM, estimate_focal=False).held_off is None
+    assert estimate_uncertainty(clip_of(), held, PRIOR_MM, estimate_focal=False).held_off is None

@@ -6,7 +6,7 @@ import torch
 
 from shared.geometry import fibonacci_sphere
 from shared.lobe_tables import specular_slopes, specular_tables
-from shared.lobes import LobeTable, specular_reflection
+from shared.lobes import SpecularTransfer, specular_reflection
 from shared.mesh import normalised
 from shared.solve.products import per_channel, per_channel_transposed, reflect, reflect_transposed
 
@@ -45,7 +45,7 @@ def test_slopes_are_the_derivative_by_the_log_roughness(roughness):
     normals = normalised(RNG.normal(size=(20, 3)) + [0.0, 0.0, 3.0])
     towards = normalised(normals + 0.4 * RNG.normal(size=(20, 3)))
     visible = np.tile(directions[:, 0] > 0, (20, 1))
-    table = LobeTable(normals, visible, directions)
+    table = SpecularTransfer(normals, visible, directions)
     assert table.resolves(roughness) == (roughness > 0.25)
     light = (1.0 + directions @ [0.3, 0.2, 0.5])[:, None] * np.array([1.0, 0.8, 0.6])
     slopes, blocked = specular_slopes(table, towards[:, None], roughness)

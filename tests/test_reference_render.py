@@ -12,7 +12,7 @@ from shared.mesh import vertex_normals
 from shared.raycast import RayScene
 from shared.solve.reference_light import PrefilteredLight
 from shared.solve.reference_raster import Raster, SurfacePoints, blend, torch_vertex_normals
-from shared.solve.reference_shade import Sampling, Shader, Texture
+from shared.solve.reference_shade import Sampling, Shader, TorchMaterial
 from shared.transfer import Points, bounce_nodes, irradiance, trace_transfer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -171,7 +171,7 @@ def test_a_surface_before_another_is_an_edge_too():
 
 
 def uniform_texture(count, albedo=0.4, specular=0.8, roughness=0.4):
-    return Texture(
+    return TorchMaterial(
         torch.full((count, 3), albedo, dtype=DOUBLE),
         torch.full((count,), specular, dtype=DOUBLE),
         torch.full((count,), roughness, dtype=DOUBLE),
@@ -275,7 +275,7 @@ def test_gradients_of_material_and_light():
 
     def value(**changed):
         at = inputs | changed
-        material = Texture(at["albedo"], at["specular"], at["roughness"])
+        material = TorchMaterial(at["albedo"], at["specular"], at["roughness"])
         turn = rotation_from_vector(np.array([0.1, 0.4, 0.0]))
         found = shader(at["light"], points, material, scene, turn, generator(), importance=light)
         return (weights * found).sum()
@@ -303,7 +303,7 @@ def test_interior_gradients_of_vertices(ball):
         points, pixels = seen_points(ball, vertices)
         albedo = 0.3 + 0.2 * torch.sin(9.0 * points.uv[:, :1] + torch.arange(3, dtype=DOUBLE))
         rough = 0.35 + 0.1 * torch.cos(7.0 * points.uv[:, 1])
-        texture = Texture(albedo, torch.full_like(rough, 0.9), rough)
+        texture = TorchMaterial(albedo, torch.full_like(rough, 0.9), rough)
         colours = shader(light, points, texture, scene, np.eye(3), generator())
         weights = torch.rand((len(pixels), 3), generator=generator(5), dtype=DOUBLE)
         return (weights * colours).sum()

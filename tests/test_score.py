@@ -17,7 +17,7 @@ from shared.mesh import vertex_normals
 from shared.texture import sample_bilinear
 from tools import score_align, score_measures
 from tools.score import main, score
-from tools.score_buffers import SurfaceViewer
+from tools.score_buffers import BufferRenderer
 
 TINY = Path(__file__).parent / "tiny"
 SCALE, TURN, SHIFT = 0.93, rotation_from_vector(np.array([0.1, -0.2, 0.05])), np.array([5.0, -20.0, 33.0])
@@ -149,7 +149,7 @@ def test_the_viewer_sees_a_sphere_where_it_is():
     pose[2, 3] = 950
     intrinsics = np.array([[500.0, 0, 64], [0, 500.0, 64], [0, 0, 1]])
     pixels = np.array([[63, 63], [63, 43], [2, 2]])
-    seen = SurfaceViewer(mesh, {"ramp": ramp}).view(pose, intrinsics, pixels)
+    seen = BufferRenderer(mesh, {"ramp": ramp}).view(pose, intrinsics, pixels)
     np.testing.assert_allclose(seen["coverage"], [1, 1, 0])
     np.testing.assert_allclose(seen["normal"][0], [0, 0, 1], atol=0.02)
     # The ray through that pixel, (0, slope, -1), meets the sphere at y = slope (950 - z).

@@ -11,7 +11,7 @@ from shared.brdf import directional_albedo, specular_cosine
 from shared.envmap import cube_directions, cube_solid_angles
 from shared.geometry import fibonacci_sphere
 from shared.lobe_tables import specular_tables
-from shared.lobes import LobeTable, specular_reflection
+from shared.lobes import SpecularTransfer, specular_reflection
 from shared.mesh import normalised
 from shared.raycast import RayScene
 from shared.shading import Material, VertexShading, key_frames, turned_so_far
@@ -30,7 +30,7 @@ def towards_at(cosines):
 def upward_table(visible=None):
     """As many points as COSINES with the normal +z."""
     visible = np.ones((len(COSINES), len(DIRECTIONS)), bool) if visible is None else visible
-    return LobeTable(np.tile([0.0, 0, 1], (len(COSINES), 1)), visible, DIRECTIONS)
+    return SpecularTransfer(np.tile([0.0, 0, 1], (len(COSINES), 1)), visible, DIRECTIONS)
 
 
 def lamp(directions):
@@ -81,7 +81,7 @@ def test_tables_are_the_same_lobes():
 
 def test_a_part_of_the_table_is_those_points():
     normals = normalised(np.random.default_rng(1).normal(size=(40, 3)))
-    table = LobeTable(normals, np.ones((40, 768), bool), DIRECTIONS)
+    table = SpecularTransfer(normals, np.ones((40, 768), bool), DIRECTIONS)
     index = np.array([30, 3])
     whole = specular_reflection(table, normals, 0.5, lamp(DIRECTIONS))
     assert len(table.take(index)) == 2
@@ -158,20 +158,21 @@ def test_reflections_between_key_frames_are_interpolated():
         assert np.abs(coarse.reflection(f) - every.reflection(f))[front].max() < 0.02 * every.reflection(f).max()
 
 
-def test_doubt_about_shadows_is_interpolated_between_key_frames():
+def test_uncertainty_of_shadows_is_interpolated_between_key_frames():
     """A ball casts no shadows on itself, so that there is little of it; a frame's lies between those of its keys."""
     poses = nods(np.linspace(0.0, 8.0, 9))
     light = np.repeat(lamp(cube_directions(16)), 3, axis=1)
     shading, _ = shade(sphere(40.0, 5), light, poses, key_step=np.radians(4.0))
-    doubts, brightest = np.stack([shading.shadow_doubt(f) for f in range(len(poses))]), shading.irradiance(0).max()
-    assert np.median(doubts) < 0.02 * brightest and doubts.max() < 0.2 * brightest
+    uncertainties = np.stack([shading.shadow_uncertainty(f) for f in range(len(poses))])
+    brightest = shading.irradiance(0).max()
+    assert np.median(uncertainties) < 0.02 * brightest and uncertainties.max() < 0.2 * brightest
     keys = key_frames(turned_so_far(poses), np.radians(4.0))
     assert np.diff(keys).max() > 2
     for low, high in zip(keys[:-1], keys[1:], strict=True):
-        least, most = np.sort(doubts[[low, high]], axis=0)
-        for between in doubts[low + 1 : high]:
+        least, most = np.sort(uncertainties[[low, high]], axis=0)
+        for between in uncertainties[low + 1 : high]:
             assert (between >= least - 1e-6).all() and (between <= most + 1e-6).all()
-        assert (doubts[low] != doubts[high]).any()
+        assert (uncertainties[low] != uncertainties[high]).any()
 
 
 def test_vertices_without_shading_take_the_nearest():

@@ -9,7 +9,7 @@ from toy_head import toy_head
 from shared.geometry import rigid, rotation_from_vector
 from shared.mesh import Mesh, subdivide, vertex_normals
 from shared.raycast import RayScene, camera_hits
-from shared.solve.silhouette import Outlines, RimSettings, fit_outline, mask_distance, rim_of
+from shared.solve.silhouette import ContourSettings, Outlines, fit_outline, mask_distance, occluding_contour
 
 FRAMES, SIZE = 9, 240
 LENS = np.array([[900.0, 0, SIZE / 2], [0, 900.0, SIZE / 2], [0, 0, 1]])
@@ -40,11 +40,11 @@ def test_distance_is_zero_on_the_border_and_grows_outside():
     np.testing.assert_allclose(distance[10, 8:12], [1.5, 0.5, -0.5, -1.5])
 
 
-def test_rim_of_the_true_mesh_lies_on_the_border(egg):
-    rim = rim_of(egg, np.ones(len(egg.faces), bool), outlines_of(egg), 8.0)
-    assert len(np.unique(rim.frame)) == FRAMES and len(rim.distance) > 40 * FRAMES
-    assert abs(np.median(rim.distance)) < 0.3
-    assert np.percentile(np.abs(rim.distance), 90) < 0.7
+def test_occluding_contour_of_the_true_mesh_lies_on_the_border(egg):
+    contour = occluding_contour(egg, np.ones(len(egg.faces), bool), outlines_of(egg), 8.0)
+    assert len(np.unique(contour.frame)) == FRAMES and len(contour.distance) > 40 * FRAMES
+    assert abs(np.median(contour.distance)) < 0.3
+    assert np.percentile(np.abs(contour.distance), 90) < 0.7
 
 
 def test_distance_changes_with_the_surface_as_the_slope_says(egg):
@@ -52,8 +52,8 @@ def test_distance_changes_with_the_surface_as_the_slope_says(egg):
     outlines = outlines_of(egg.replace(vertices=1.05 * egg.vertices))
     normals = vertex_normals(egg.vertices, egg.faces)
     usable = np.ones(len(egg.faces), bool)
-    before = rim_of(egg, usable, outlines, 20.0)
-    after = rim_of(egg.replace(vertices=egg.vertices + 0.5 * normals), usable, outlines, 20.0)
+    before = occluding_contour(egg, usable, outlines, 20.0)
+    after = occluding_contour(egg.replace(vertices=egg.vertices + 0.5 * normals), usable, outlines, 20.0)
     across = np.einsum("ne,nex->nx", np.stack([1 - before.share, before.share], 1), normals[before.edge])
     predicted = 0.5 * np.median((across * before.slope).sum(1))
     assert predicted == pytest.approx(0.5, rel=0.1)  # one pixel is a millimetre away
@@ -65,10 +65,10 @@ def test_outline_is_met_where_nothing_is_known(egg):
     normals = vertex_normals(egg.vertices, egg.faces)
     small = egg.replace(vertices=egg.vertices - 4.0 * far[:, None] * normals)
     outlines = outlines_of(egg)
-    met, record = fit_outline(small, np.ones(len(egg.faces), bool), ~far, outlines, RimSettings(rounds=4))
+    met, record = fit_outline(small, np.ones(len(egg.faces), bool), ~far, outlines, ContourSettings(rounds=4))
     assert record["held_out_px"]["after"] < 0.4 * record["held_out_px"]["before"]
-    rim = rim_of(small, np.ones(len(egg.faces), bool), outlines, 8.0)
-    seen = np.unique(rim.edge)
+    contour = occluding_contour(small, np.ones(len(egg.faces), bool), outlines, 8.0)
+    seen = np.unique(contour.edge)
     seen = seen[far[seen]]
     left = ((met.vertices - egg.vertices) * normals).sum(1)
     assert np.median(np.abs(left[seen])) < 1.5
@@ -80,7 +80,7 @@ def test_a_mask_of_something_else_moves_nothing(egg):
     """Borders farther away than the reach are not the head's."""
     outlines = outlines_of(egg.replace(vertices=1.5 * egg.vertices))
     usable, known = np.ones(len(egg.faces), bool), np.zeros(len(egg.vertices), bool)
-    met, record = fit_outline(egg, usable, known, outlines, RimSettings())
+    met, record = fit_outline(egg, usable, known, outlines, ContourSettings())
     np.testing.assert_array_equal(met.vertices, egg.vertices)
     assert record == {"met": 0.0}
 
@@ -92,7 +92,7 @@ def test_hair_does_not_pull_the_head_out(egg):
     hair = tuple(np.where(chin, bare, np.minimum(bare, full)) for bare, full in zip(own, wide, strict=True))
     outlines = replace(outlines_of(egg), distance=hair)
     usable, known = np.ones(len(egg.faces), bool), np.zeros(len(egg.vertices), bool)
-    assert len(rim_of(egg, usable, outlines, 8.0).distance) > 100
-    met, record = fit_outline(egg, usable, known, outlines, RimSettings())
+    assert len(occluding_contour(egg, usable, outlines, 8.0).distance) > 100
+    met, record = fit_outline(egg, usable, known, outlines, ContourSettings())
     np.testing.assert_array_equal(met.vertices, egg.vertices)
     assert 0.05 < record["met"] < 0.6

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from toy_capture import coloured_light, make_truth, swinging
 
-from shared.solve.appearance import Settings
+from shared.solve.appearance import AppearanceSettings
 from shared.solve.fit_appearance import fit_appearance
 from shared.solve.skin_prior import SkinPrior, SkinVariation
 
-SETTINGS = Settings(resolutions=(6,), steps=8, specular=False, noise=(0.003, 0.01))
+SETTINGS = AppearanceSettings(resolutions=(6,), steps=8, specular=False, noise=(0.003, 0.01))
 TAN = np.array([0.50, 0.31, 0.23])
 SMALL_TURN = swinging(turn=np.radians(10.0))
 

@@ -37,8 +37,8 @@ def node(tmp_path_factory):
 def batch(tmp_path):
     """(pipeline, folder of subjects, profile): the committed profile with what this cluster differs in."""
     pipeline = copy_pipeline(tmp_path / "toy")
-    booked = "{needs: [read_text], resources: {mem_mb: 300, runtime: 5}}"
-    pipeline.write_text(pipeline.read_text().replace("{needs: [read_text]}", booked))
+    requested = "{needs: [read_text], resources: {mem_mb: 300, runtime: 5}}"
+    pipeline.write_text(pipeline.read_text().replace("{needs: [read_text]}", requested))
     for i in range(SUBJECTS):
         make_subject(tmp_path / "batch" / f"s{i}")
     shutil.copytree(REPOSITORY / "profiles" / "slurm", tmp_path / "profile")

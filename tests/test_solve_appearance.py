@@ -22,7 +22,7 @@ from shared.envmap import cube_directions
 from shared.geometry import fibonacci_sphere
 from shared.mesh import normalised
 from shared.shading import light_along
-from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.appearance import AppearanceSettings, AppearanceSolver
 from shared.solve.fit_appearance import fit_appearance
 
 
@@ -40,7 +40,7 @@ def after_shaping(solution):
 @pytest.fixture(scope="module")
 def solution(truth):
     capture, _, _ = truth
-    settings = Settings(resolutions=(8,), steps=7, noise=(0.003, 0.01), roughness=0.45)
+    settings = AppearanceSettings(resolutions=(8,), steps=7, noise=(0.003, 0.01), roughness=0.45)
     return fit_appearance(capture, settings)
 
 
@@ -80,7 +80,7 @@ def test_residuals_come_down_to_the_noise(solution):
 
 def test_the_last_of_the_best_held_out_states_wins(truth, solution):
     """Where the prior on skin has nothing against it."""
-    count = Settings().independent * (~truth[0].fitted).mean()
+    count = AppearanceSettings().independent * (~truth[0].fitted).mean()
     records = after_shaping(solution)
     judged = np.array([record["held_out"] * np.sqrt(1.0 + 2.0 * record["skin_prior"] / count) for record in records])
     last = int(np.nonzero(judged <= 1.003 * judged.min())[0][-1])
@@ -90,7 +90,7 @@ def test_the_last_of_the_best_held_out_states_wins(truth, solution):
 
 def test_the_fit_goes_on_until_the_scale_rests(truth):
     """Highlights tell the scale, step by step, while the residual stays."""
-    settings = Settings(resolutions=(8,), steps=20, noise=(0.003, 0.01), roughness=0.45)
+    settings = AppearanceSettings(resolutions=(8,), steps=20, noise=(0.003, 0.01), roughness=0.45)
     found = fit_appearance(truth[0], settings)
     assert found.trusted and len(after_shaping(found)) > 2 and len(found.iterations) < 20
     assert found.iterations[-1]["rescaled"] < 0.01
@@ -111,7 +111,7 @@ def test_the_fit_stops_where_held_out_frames_stop_improving(matte):
 def test_highlights_wait_until_the_light_has_found_its_lamp():
     """A small lamp in the dark: with highlights from the fourth step on, the scale ends at half of what it is."""
     capture, albedo, _ = make_truth(lights=(small_lamp,))
-    found = fit_appearance(capture, Settings(resolutions=(8,), steps=12, noise=(0.003, 0.01), roughness=0.45))
+    found = fit_appearance(capture, AppearanceSettings(resolutions=(8,), steps=12, noise=(0.003, 0.01), roughness=0.45))
     shaping = [record["fitted"] for record in found.iterations if record["shaping"]]
     assert len(shaping) > 3 and shaping[-1] > 0.9 * shaping[-2]
     assert np.abs(np.log(np.median(found.state.albedo / albedo, axis=0))).max() < 0.2
@@ -121,7 +121,7 @@ def test_highlights_wait_until_the_light_has_found_its_lamp():
 def test_highlights_join_a_light_that_was_found_without_them():
     """Judged at once, in a light that stands for them too, they lead the fit away: its second step is undone."""
     capture, albedo, _ = make_truth(lights=(coloured_light,))
-    settings = Settings(resolutions=(8,), steps=12, noise=(0.003, 0.01), roughness=0.45)
+    settings = AppearanceSettings(resolutions=(8,), steps=12, noise=(0.003, 0.01), roughness=0.45)
     matte = fit_appearance(capture, replace(settings, specular=False))
     start = replace(matte, state=replace(matte.state, specular=0.7, roughness=0.45), trusted=True)
     found = fit_appearance(capture, settings, start=start, shapes=True)
@@ -135,7 +135,7 @@ def test_highlights_wait_while_a_light_of_fewer_numbers_takes_shape():
     """A hard lamp that harmonics cannot show: judged at once in what is left of it, highlights end as narrow as can be,
     and the blue channel's scale is off by half."""
     capture, albedo, _ = make_truth(lights=(hard_light,))
-    settings = Settings("harmonics_2", (8,), steps=12, noise=(0.003, 0.01), roughness=0.45)
+    settings = AppearanceSettings("harmonics_2", (8,), steps=12, noise=(0.003, 0.01), roughness=0.45)
     found = fit_appearance(capture, settings)
     first = [record["light"] for record in found.iterations].index("harmonics_2")
     shaping = [record["shaping"] for record in found.iterations[first:]]
@@ -147,7 +147,7 @@ def test_highlights_wait_while_a_light_of_fewer_numbers_takes_shape():
 def test_a_fit_goes_on_from_a_solution(truth, solution):
     """From the solution of the same capture: the last resolution alone, until the scale rests, to the same residual or
     below."""
-    settings = Settings(resolutions=(4, 8), steps=12, noise=(0.003, 0.01), roughness=0.45)
+    settings = AppearanceSettings(resolutions=(4, 8), steps=12, noise=(0.003, 0.01), roughness=0.45)
     again = fit_appearance(truth[0], settings, start=solution)
     assert {record["resolution"] for record in again.iterations} == {8}
     assert len(again.iterations) <= 8
@@ -172,7 +172,7 @@ def test_a_step_that_leads_away_is_undone_and_ends_its_resolution(truth, monkeyp
         return record, rise, by_frame
 
     monkeypatch.setattr(module, "_step", spoilt)
-    found = fit_appearance(capture, Settings(resolutions=(4, 8), steps=5, noise=(0.003, 0.01)))
+    found = fit_appearance(capture, AppearanceSettings(resolutions=(4, 8), steps=5, noise=(0.003, 0.01)))
     undone = [record for record in found.iterations if record.get("undone")]
     assert len(undone) == 1 and sum(trusted) == 1
     assert field_faults(undone[0], below(SOLVE, "iterations[]")) == []
@@ -195,11 +195,11 @@ def test_a_roughness_at_the_end_of_its_range_does_not_keep_the_scale_waiting(tru
 
     monkeypatch.setattr(module, "ROUGHNESS_RANGE", (0.48, 0.7))
     capture, albedo, _ = truth
-    settings = Settings(resolutions=(8,), steps=12, noise=(0.003, 0.01), roughness=0.55)
+    settings = AppearanceSettings(resolutions=(8,), steps=12, noise=(0.003, 0.01), roughness=0.55)
     solver = AppearanceSolver(capture, replace(settings, roughness=0.5))
-    assert solver.roughen(-1.0) == pytest.approx(np.log(0.5 / 0.48))
-    assert solver.roughen(-1.0) == 0.0 and solver.state.roughness == 0.48
-    assert solver.roughen(0.05) == pytest.approx(0.05)
+    assert solver.update_roughness(-1.0) == pytest.approx(np.log(0.5 / 0.48))
+    assert solver.update_roughness(-1.0) == 0.0 and solver.state.roughness == 0.48
+    assert solver.update_roughness(0.05) == pytest.approx(0.05)
 
     found = fit_appearance(capture, settings)
     assert found.state.roughness == pytest.approx(0.48)

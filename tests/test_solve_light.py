@@ -15,7 +15,7 @@ from shared.solve.scale import (
     Highlights,
     fit_skin_locus,
     most_likely_irradiance,
-    settle_scale,
+    resolve_scale,
 )
 
 DIRECTIONS = fibonacci_sphere(256)
@@ -170,13 +170,13 @@ def test_highlights_tell_a_bright_light_from_bright_skin():
     skin, mean = on_the_locus(), (0.7, 0.35)
     light = np.full(3, np.log(2.0))
     found = Highlights(np.full(3, 0.35), np.full(3, 100.0), np.ones(3))
-    log_factor, specular = settle_scale(skin - light, light, found, mean)
+    log_factor, specular = resolve_scale(skin - light, light, found, mean)
     assert np.allclose(log_factor, -np.log(2.0), atol=1e-6)
     assert specular == pytest.approx(0.7, rel=1e-6)
-    without, specular = settle_scale(skin - light, light, None, mean)
+    without, specular = resolve_scale(skin - light, light, None, mean)
     assert np.allclose(without, -np.log(2.0), atol=1e-6) and specular == 0.7
     stronger = Highlights(np.full(3, 0.7), np.full(3, 100.0), np.ones(3))
-    assert (settle_scale(skin - light, light, stronger, mean)[0] > -np.log(2.0) + 0.05).all()
+    assert (resolve_scale(skin - light, light, stronger, mean)[0] > -np.log(2.0) + 0.05).all()
 
 
 def test_skin_locus_runs_through_the_reference_skins():

@@ -17,11 +17,11 @@ from shared.geometry import projection_slope, rigid, rotation_from_vector
 from shared.mesh import Mesh, interpolate, normalised, tangent_frames, vertex_normals
 from shared.raycast import RayScene, camera_hits
 from shared.shading import Material, VertexShading
-from shared.solve.appearance import Settings
-from shared.solve.capture import Sizes, set_scenery
+from shared.solve.appearance import AppearanceSettings
+from shared.solve.capture import Sizes, precompute_transfer
 from shared.solve.light_and_mesh import judge_shape
-from shared.solve.shape import Reflectance, ShapeClip, ShapeSettings, ShapeSolver, Surface
-from shared.solve.shape_equations import EquationSettings, excess
+from shared.solve.shape import Reflectance, ShapeClip, ShapedSurface, ShapeSettings, ShapeSolver
+from shared.solve.shape_equations import EquationSettings, variance_inflation
 from shared.solve.shape_step import TrackPoints, large_step_metric, normal_turns, solve_offsets
 from shared.solve.shape_terms import Reflections, shading_terms
 from shared.transfer import mesh_points
@@ -58,16 +58,16 @@ class Toy:
 
 
 def shade(mesh, poses, light):
-    """Vertex shading, its scenery and material under a light."""
+    """Vertex shading, its precomputed and material under a light."""
     viewer = SurfaceViewer.of(mesh)
-    scenery = set_scenery(viewer, SIZES)
+    precomputed = precompute_transfer(viewer, SIZES)
     points = mesh_points(mesh)
-    material = Material(true_albedo(scenery.nodes.points.positions), SPECULAR, ROUGHNESS)
+    material = Material(true_albedo(precomputed.nodes.points.positions), SPECULAR, ROUGHNESS)
     index = np.arange(len(mesh.vertices))
-    transfer = scenery.trace(points)
-    traced = points, transfer, scenery.node_transfer
-    shading = VertexShading(index, mesh.vertices, *traced, material, light, scenery.directions, poses, "head")
-    return shading, scenery, material
+    transfer = precomputed.trace(points)
+    traced = points, transfer, precomputed.node_transfer
+    shading = VertexShading(index, mesh.vertices, *traced, material, light, precomputed.directions, poses, "head")
+    return shading, precomputed, material
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def toy():
     depth = 2.5 * np.exp(-0.5 * (np.linalg.norm(start.vertices - place, axis=1) / 14.0) ** 2)
     truth = start.replace(vertices=start.vertices - depth[:, None] * normals)
     poses, light = swinging(), true_light(cube_directions(16))
-    shading, scenery, material = shade(truth, poses, light)
+    shading, precomputed, material = shade(truth, poses, light)
     albedo, scene = true_albedo(truth.vertices), RayScene(truth.vertices, truth.faces)
     pictures = []
     for f, pose in enumerate(poses):
@@ -95,12 +95,12 @@ def toy():
     known = np.nonzero((depth < 0.01) & (start.vertices[:, 2] > 20.0))[0][::3]
     tracks = TrackPoints(start.vertices[known], np.full(len(known), 0.15))
     clip = ShapeClip(pictures.__getitem__, poses, LENS, fitted, "head", tracks)
-    known = Reflectance(light, SPECULAR, ROUGHNESS, scenery.nodes, material.node_albedo)
+    known = Reflectance(light, SPECULAR, ROUGHNESS, precomputed.nodes, material.node_albedo)
     return Toy(start, truth, clip, known)
 
 
 def solver_of(toy, **changes):
-    return ShapeSolver(toy.clip, toy.reflectance, Settings(), SIZES, ShapeSettings(**changes))
+    return ShapeSolver(toy.clip, toy.reflectance, AppearanceSettings(), SIZES, ShapeSettings(**changes))
 
 
 def test_projection_slope_is_the_derivative_of_the_projection():
@@ -199,16 +199,16 @@ def test_irradiance_turns_with_the_normal(toy):
     np.testing.assert_allclose(terms.irradiance_turn[..., 0], change, atol=0.06 * np.abs(change).max())
 
 
-def test_excess_is_one_for_independent_noise_and_grows_with_what_neighbours_share():
+def test_variance_inflation_is_one_for_independent_noise_and_grows_with_what_neighbours_share():
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-80.0, 80.0, (6000, 2)), np.zeros(6000)])
     power = rng.uniform(0.5, 2.0, len(points))
     independent = np.sqrt(power) * rng.normal(size=len(points))
-    assert 1.0 <= excess(points, independent, power) < 1.15
+    assert 1.0 <= variance_inflation(points, independent, power) < 1.15
     cell = np.unique(np.floor(points / 8.0), axis=0, return_inverse=True)[1].ravel()
     shared = 0.5 * np.sqrt(power) * rng.normal(size=cell.max() + 1)[cell]
     in_cell = len(points) / (cell.max() + 1)
-    found = excess(points, independent + shared, power)
+    found = variance_inflation(points, independent + shared, power)
     assert 0.3 * in_cell * 0.25 < found - 1.0 < 1.2 * in_cell * 0.25
 
 
@@ -246,7 +246,7 @@ def test_the_shape_goes_on_past_one_worse_step_and_keeps_the_best(toy, monkeypat
     def examine(mesh, shaped, traced):
         value = judged[height(mesh)]
         equations = SimpleNamespace(judged=value, fitted=value, held_out=value)
-        return Surface(mesh, np.arange(3), np.zeros((3, 2, 3)), equations)
+        return ShapedSurface(mesh, np.arange(3), np.zeros((3, 2, 3)), equations)
 
     normals = vertex_normals(toy.start.vertices, toy.start.faces)
     monkeypatch.setattr(solver, "examine", examine)

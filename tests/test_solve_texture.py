@@ -42,12 +42,12 @@ def random_frames(texels, frames=7, seed=0):
     return irradiance, reflection, colours, weight
 
 
-def accumulated(irradiance, reflection, colours, weight, limits=None):
+def accumulated(irradiance, reflection, colours, weight, saturation=None):
     equations = NormalEquations(irradiance.shape[1], NOISE)
-    limits = np.zeros(colours.shape, np.int8) if limits is None else limits
+    saturation = np.zeros(colours.shape, np.int8) if saturation is None else saturation
     for f in range(len(irradiance)):
         rows = np.nonzero(weight[f] > 0)[0]
-        samples = TexelSamples(rows, colours[f, rows], weight[f, rows], limits[f, rows])
+        samples = TexelSamples(rows, colours[f, rows], weight[f, rows], saturation[f, rows])
         equations.add(samples, irradiance[f, rows], reflection[f, rows], np.ones((len(rows), 3)))
     return equations
 
@@ -66,7 +66,7 @@ def test_albedo_is_weighted_least_squares():
 
 
 def test_intensity_is_joint_least_squares_with_albedo():
-    """Four unknowns per texel at once give what the equations with the albedo eliminated give."""
+    """Four unknowns per texel at once give what the equations with the albedo projected out give."""
     frames = random_frames(16, frames=9, seed=1)
     irradiance, reflection, colours, weight = frames
     found = pooled_specular(FewTexels(4), accumulated(*frames), 1e-3, 0.5, 1e4)
@@ -103,9 +103,9 @@ def test_what_is_left_of_a_mostly_clipped_texel_says_little():
     """The few samples of red that are not clipped are its darkest: worth less than the same few seen alone."""
     frames = random_frames(10, frames=8)
     frames[3][:] = 1.0
-    limits = np.zeros(frames[2].shape, np.int8)
-    limits[:6, :, 0] = 1
-    found = accumulated(*frames, limits).information(np.full(3, 0.9), NEVER_WRONG)
+    saturation = np.zeros(frames[2].shape, np.int8)
+    saturation[:6, :, 0] = 1
+    found = accumulated(*frames, saturation).information(np.full(3, 0.9), NEVER_WRONG)
     alone = accumulated(*(x[6:] for x in frames)).information(np.full(3, 0.9), NEVER_WRONG)
     whole = accumulated(*frames).information(np.full(3, 0.9), NEVER_WRONG)
     assert (found[:, 0] < 0.5 * alone[:, 0]).all()
@@ -142,18 +142,18 @@ def test_errors_of_highlights_count_by_their_share():
 def test_robust_weights():
     colours = np.full((4, 3), 0.5, np.float32)
     model = colours + np.array([[0.0], [0.02 * 2.5], [5.0], [-0.2]], np.float32)
-    limits = np.zeros((4, 3), np.int8)
-    samples = TexelSamples(np.arange(4), colours, np.ones(4), limits)
+    saturation = np.zeros((4, 3), np.int8)
+    samples = TexelSamples(np.arange(4), colours, np.ones(4), saturation)
     known = np.full(4, 1e9)
     weight = robust_weight(model, samples, NOISE, known)
     assert np.allclose(weight[0], 1.0) and np.allclose(weight[1], 0.5) and (weight[2] < 1e-4).all()
-    limits[2], limits[3] = 1, 1
+    saturation[2], saturation[3] = 1, 1
     weight = robust_weight(model, samples, NOISE, known)
     assert (weight[2] == 0).all(), "a clipped sample is satisfied by any brighter model"
     assert (weight[3] > 0).all(), "and still pulls a darker one up"
-    limits[3] = -1
+    saturation[3] = -1
     assert (robust_weight(model, samples, NOISE, known)[3] == 0).all()
-    limits[:] = 0
+    saturation[:] = 0
     guessed = robust_weight(model, samples, NOISE, np.zeros(4))
     told = robust_weight(model, samples, NOISE, known)
     assert (guessed[3] > 3.0 * told[3]).all(), "a model that knows nothing does not overrule a sample"

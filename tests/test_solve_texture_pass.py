@@ -34,7 +34,7 @@ class PlateShading:
     def mean_slope(self, frames):
         return np.zeros((len(self.uvs), 3))
 
-    def shadow_doubt(self, frame):
+    def shadow_uncertainty(self, frame):
         return np.zeros((len(self.uvs), 3), np.float32)
 
     def reflection(self, frame):
@@ -44,11 +44,11 @@ class PlateShading:
 
 
 class ShadedPlate(PlateShading):
-    """The plate with a shadow that wanders over it, its border off by shift; doubt: whether that is known."""
+    """The plate with a shadow that wanders over it, its border off by shift; uncertainty: whether that is known."""
 
-    def __init__(self, mesh, shift=0.0, doubt=False):
+    def __init__(self, mesh, shift=0.0, uncertainty=False):
         super().__init__(mesh)
-        self.shift, self.doubt = shift, doubt
+        self.shift, self.uncertainty = shift, uncertainty
 
     def open_share(self, frame, shift):
         border = 0.15 + 0.02 * frame + shift
@@ -57,9 +57,9 @@ class ShadedPlate(PlateShading):
     def irradiance(self, frame):
         return super().irradiance(frame) * self.open_share(frame, self.shift)
 
-    def shadow_doubt(self, frame):
+    def shadow_uncertainty(self, frame):
         spread = self.open_share(frame, self.shift + 0.05) - self.open_share(frame, self.shift - 0.05)
-        return self.doubt * np.abs(spread) * super().irradiance(frame)
+        return self.uncertainty * np.abs(spread) * super().irradiance(frame)
 
 
 def true_albedo(uv):
@@ -151,19 +151,19 @@ def test_borders_of_shadows_that_lie_elsewhere_spoil_little():
     """Samples near a border that may lie elsewhere count less, and texels that have no others are trusted less."""
     mesh, found = grid_plane(33, 80.0), []
     surface, viewer, clip = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh), plate_clip(mesh, ShadedPlate(mesh))
-    for doubt in (False, True):
-        shading = ShadedPlate(mesh, 0.04, doubt)
+    for uncertainty in (False, True):
+        shading = ShadedPlate(mesh, 0.04, uncertainty)
         material, _ = TexturePass(surface, viewer, shading, clip, SPECULAR, np.array([0.5, 0.4, 0.25])).run((np.inf,))
         confidence = make_maps(surface, material, 0.4)["confidence"].ravel()[surface.pixel]
         found.append((np.abs(np.log(material.albedo / true_albedo(texel_uv(surface)))).max(1), confidence))
-    (plain, sure), (doubted, less_sure) = found
+    (plain, sure), (uncertain, less_sure) = found
     u = texel_uv(surface)[:, 0]
     crossed, never = (u > 0.12) & (u < 0.4), (u > 0.5) & (u < 0.7)
-    assert np.mean(doubted[crossed] ** 2) < 0.6 * np.mean(plain[crossed] ** 2)
+    assert np.mean(uncertain[crossed] ** 2) < 0.6 * np.mean(plain[crossed] ** 2)
     trusted = [np.sqrt(np.mean(error[crossed & (conf > 0.5)] ** 2)) for error, conf in found]
     assert trusted[1] < 0.3 * trusted[0], "what is still trusted is right"
-    for with_doubt, without in ((doubted, plain), (less_sure, sure)):
-        assert np.allclose(with_doubt[never], without[never], atol=0.01)
+    for with_uncertainty, without in ((uncertain, plain), (less_sure, sure)):
+        assert np.allclose(with_uncertainty[never], without[never], atol=0.01)
 
 
 def test_clipped_frames_do_not_darken_the_albedo():

@@ -6,7 +6,7 @@ from quadrature import hemisphere_quadrature
 
 from shared.brdf import directional_albedo, microfacet_integrals, specular_cosine
 from shared.geometry import fibonacci_sphere
-from shared.lobes import LobeTable, specular_reflection
+from shared.lobes import SpecularTransfer, specular_reflection
 from shared.mesh import normalised
 from shared.split_sum import SplitSum, frames_about, narrowest_roughness, sample_half_vectors
 
@@ -46,7 +46,7 @@ def both_ways(roughness, covered):
     visible = np.tile(occluder(DIRECTIONS) if covered else np.ones(768, bool), (4, 1)) & (DIRECTIONS[:, 2] > 0)
     found = []
     for narrowest in (1.0, 0.0):
-        table = LobeTable(np.tile(UP, (4, 1)), visible, DIRECTIONS)
+        table = SpecularTransfer(np.tile(UP, (4, 1)), visible, DIRECTIONS)
         table.narrowest = narrowest
         found.append(specular_reflection(table, TOWARDS, roughness, sky(DIRECTIONS)[:, None])[:, 0])
     return found
@@ -72,7 +72,7 @@ def test_a_mirror_sees_or_does_not_and_a_rough_surface_sees_a_share():
 def test_white_light_returns_the_directional_albedo(roughness):
     every, _ = SplitSum(DIRECTIONS).prefilter(TOWARDS, roughness), None
     assert np.allclose(every.sum(1), 1.0)
-    table = LobeTable(np.tile(UP, (4, 1)), np.ones((4, 768), bool), DIRECTIONS)
+    table = SpecularTransfer(np.tile(UP, (4, 1)), np.ones((4, 768), bool), DIRECTIONS)
     table.narrowest = 1.0
     found = specular_reflection(table, TOWARDS, roughness, np.ones((768, 1)))[:, 0]
     assert np.allclose(found, directional_albedo(COSINES, roughness), rtol=0.01)

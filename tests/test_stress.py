@@ -10,10 +10,10 @@ from shared.geometry import project, rigid, vector_from_rotation
 from shared.io.arrays import read_json, write_json
 from tools import stress
 from tools.stress_camera import Sensor, compressed, defocused, drift, photograph, shaken, smeared
-from tools.stress_dials import DIALS, Case, Dial
+from tools.stress_dials import PERTURBATIONS, Perturbation, StressCase
 from tools.stress_judge import FAILED, LIMITS, RIGHT, SAID, SILENT, WARNED, judge
 from tools.stress_subject import sliding_landmarks, wrong_poses
-from tools.stress_takes import Take, smile_of
+from tools.stress_takes import StressScene, smile_of
 from tools.synth_head import head_turn
 
 NO_NOISE = {"shot_noise": 0.0, "read_noise": 0.0}
@@ -93,7 +93,7 @@ def test_compression_is_worse_the_lower_its_quality():
     assert errors[0] < errors[1] < errors[2] and compressed(codes, 0) is codes
 
 
-def test_poses_and_landmarks_are_off_by_what_the_dial_says():
+def test_poses_and_landmarks_are_off_by_what_the_perturbation_says():
     poses = head_turn(40, 950.0, -20.0, 0)
     apart = vector_from_rotation(wrong_poses(poses, 2.0)[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, :3])
     assert np.degrees(np.sqrt((apart**2).sum(1).mean())) == pytest.approx(2.0)
@@ -132,7 +132,7 @@ def row(exit_code=0, warnings=(), missed=(), **worse):
     (row(1), FAILED, ()),
 ])
 def test_the_verdict_follows_the_stated_rule(case, word, wrong):
-    """The dial at 0 gives one warning about the focus, too, and misses a gate: neither counts any more."""
+    """The perturbation at 0 gives one warning about the focus, too, and misses a gate: neither counts any more."""
     zero = row(warnings=["out of focus in 2 of 32 frames"], missed=["coverage 0.5 (expected >= 0.6)"])
     verdict = judge("focus", case, zero)
     assert (verdict.word, verdict.wrong) == (word, wrong)
@@ -146,22 +146,23 @@ def test_what_is_bad_at_zero_already_may_grow_by_its_factor():
     assert judge("focus", row(normals=limit + 0.1), zero).word == SILENT
 
 
-def test_the_dials_are_told_apart_and_grow():
-    assert len({dial.name for dial in DIALS}) == len(DIALS)
-    for dial in DIALS:
-        assert list(dial.severities) == sorted(dial.severities) and dial.severities[0] > 0
-        digests = {dial.make(severity).digest for severity in dial.severities} | {Case().digest}
-        assert len(digests) == len(dial.severities) + 1, dial.name
+def test_the_perturbations_are_told_apart_and_grow():
+    assert len({perturbation.name for perturbation in PERTURBATIONS}) == len(PERTURBATIONS)
+    for perturbation in PERTURBATIONS:
+        assert list(perturbation.severities) == sorted(perturbation.severities) and perturbation.severities[0] > 0
+        digests = {perturbation.make(severity).digest for severity in perturbation.severities} | {StressCase().digest}
+        assert len(digests) == len(perturbation.severities) + 1, perturbation.name
 
 
 def test_a_case_is_known_by_all_that_decides_it():
-    assert Case().digest == Case(mix=((Take(), 1.0),), sensor=Sensor()).digest
-    assert len({Case().digest, Case(focal_gain=1.1).digest, Case(sensor=Sensor(jpeg=50)).digest,
-                Case(mix=((Take(seed=1), 1.0),)).digest, Case(mix=((Take(), 0.5),)).digest}) == 5
+    assert StressCase().digest == StressCase(mix=((StressScene(), 1.0),), sensor=Sensor()).digest
+    assert len({StressCase().digest, StressCase(focal_gain=1.1).digest, StressCase(sensor=Sensor(jpeg=50)).digest,
+                StressCase(mix=((StressScene(seed=1), 1.0),)).digest,
+                StressCase(mix=((StressScene(), 0.5),)).digest}) == 5
 
 
-TOY = (Dial("toy", "a toy", "units", (1.0, 2.0), lambda s: Case(focal_gain=1.0 + s), "toy"),
-       Dial("other", "another", "units", (1.0,), lambda s: Case(keep=5), "other"))
+TOY = (Perturbation("toy", "a toy", "units", (1.0, 2.0), lambda s: StressCase(focal_gain=1.0 + s), "toy"),
+       Perturbation("other", "another", "units", (1.0,), lambda s: StressCase(keep=5), "other"))
 
 
 @pytest.fixture
@@ -174,7 +175,7 @@ def toy(monkeypatch):
         own = row(normals=99.0) if name == "toy_2" else row(warnings=["another toy"] if name == "toy_1" else [])
         write_json(stress.row_file(work, case), {"name": name, "code": version, "seconds": 1.0, **own})
 
-    monkeypatch.setattr(stress, "DIALS", TOY)
+    monkeypatch.setattr(stress, "PERTURBATIONS", TOY)
     monkeypatch.setattr(stress, "do_case", do)
     return ran
 
@@ -192,7 +193,7 @@ def test_rows_are_kept_and_only_what_is_missing_runs(toy, tmp_path, monkeypatch,
     stress.main([str(tmp_path), "--keep-old"])
     assert len(toy) == 5
     assert "an earlier version of a stage" in (tmp_path / "stress.md").read_text()
-    stress.main([str(tmp_path), "--dials", "other"])
+    stress.main([str(tmp_path), "--perturbations", "other"])
     assert toy[5:] == ["unspoilt", "other_1"]
 
 
@@ -217,20 +218,20 @@ def test_table_and_chart_show_every_row(toy, tmp_path):
     assert "Not run yet: a toy (1)." in (tmp_path / "stress.md").read_text()
 
 
-def test_an_unknown_dial_is_refused(tmp_path, capsys):
-    assert stress.main([str(tmp_path), "--dials", "rain"]) == 2
-    assert "no such dial" in capsys.readouterr().err and not (tmp_path / "rows").exists()
+def test_an_unknown_perturbation_is_refused(tmp_path, capsys):
+    assert stress.main([str(tmp_path), "--perturbations", "rain"]) == 2
+    assert "no such perturbation" in capsys.readouterr().err and not (tmp_path / "rows").exists()
 
 
 def test_a_row_tells_what_was_run(tmp_path, monkeypatch):
     """do_case itself, with a subject that cannot be read: refused, and kept as such."""
-    def refused(case, folder, takes):
+    def refused(case, folder, scenes):
         folder.mkdir(parents=True)
         (folder / "subject.yaml").write_text("video: absent.mp4\n")
         return folder
 
     monkeypatch.setattr("tools.stress_subject.make_subject", refused)
     (tmp_path / "rows").mkdir()
-    stress.do_case("toy", Case(), tmp_path, "code")
-    kept = read_json(stress.row_file(tmp_path, Case()))
+    stress.do_case("toy", StressCase(), tmp_path, "code")
+    kept = read_json(stress.row_file(tmp_path, StressCase()))
     assert kept["exit"] == 2 and "absent.mp4" in kept["message"] and kept["code"] == "code"

@@ -20,16 +20,16 @@ from shared.io.images import read_png
 from shared.io.models import load_face_networks
 from shared.mesh import Mesh
 from shared.texture import sample_bilinear
-from tools.synth_camera import Camera, PictureQuality, take_picture
-from tools.synth_chart import Chart, add_chart, chart_irradiance
+from tools.synth_camera import PictureQuality, PinholeCamera, take_picture
+from tools.synth_chart import PlacedChart, add_chart, chart_irradiance
 from tools.synth_gloss import GlossSamples, glossy_radiance, sample_lobe
 from tools.synth_head import DRIFT_DEG, YAW_DEG, head_turn
-from tools.synth_irradiance import IrradianceQuality, Shot, assemble_atlas, group_irradiance
+from tools.synth_irradiance import IrradianceQuality, SyntheticShot, assemble_atlas, group_irradiance
 from tools.synth_light import ENVIRONMENTS, EnvironmentLight, procedural_environment
 from tools.synth_output import ClipWriter, rounded, sensor_codes
 from tools.synth_render import RenderQuality, Scene, render
 from tools.synth_sampling import shifted_hammersley
-from tools.synth_surface import Materials, Surface
+from tools.synth_surface import Materials, SyntheticSurface
 from tools.synthesize import main
 
 TINY = Path(__file__).parent / "tiny"
@@ -71,21 +71,23 @@ def constant_light(radiance: tuple = (1.0, 2.0, 3.0)) -> EnvironmentLight:
     return EnvironmentLight(np.ones((16, 32, 1)) * np.float32(radiance))
 
 
-def irradiance_of(surface: Surface, lights: list, shots: list[Shot], quality: IrradianceQuality) -> np.ndarray:
+def irradiance_of(surface: SyntheticSurface, lights: list, shots: list[SyntheticShot],
+                  quality: IrradianceQuality) -> np.ndarray:
     groups = [group_irradiance(surface, lights, shots, group, quality, 0) for group in range(quality.groups)]
     return assemble_atlas(surface, groups, quality.size)
 
 
-FRONT_SHOT = Shot(FRONT, np.eye(3), 0, 1)
+FRONT_SHOT = SyntheticShot(FRONT, np.eye(3), 0, 1)
 COARSE = IrradianceQuality(size=48, directions=1024, lamp_samples=16, groups=4)
 
 
 def test_a_globe_in_a_white_furnace_reflects_its_albedo_and_the_lobe():
-    surface = Surface(round_mesh(80.0, np.pi, inward=False), plain())
+    surface = SyntheticSurface(round_mesh(80.0, np.pi, inward=False), plain())
     light = constant_light()
     irradiance = irradiance_of(surface, [light], [FRONT_SHOT], COARSE)[:, :, 0]
     np.testing.assert_allclose(irradiance.mean((0, 1)), np.pi * np.array([1, 2, 3]), rtol=0.01)
-    images = take_picture(surface, light, irradiance, FRONT_SHOT, Camera(64, 64, 300.0), PictureQuality(2, 16, 4))
+    images = take_picture(surface, light, irradiance, FRONT_SHOT, PinholeCamera(64, 64, 300.0),
+                          PictureQuality(2, 16, 4))
     whole = images["head"] == 1
     y, x = np.nonzero(whole)
     position = np.stack([(x - 31.5) / 300.0, (31.5 - y) / 300.0, -np.ones(len(x))], 1)
@@ -100,7 +102,7 @@ def test_a_globe_in_a_white_furnace_reflects_its_albedo_and_the_lobe():
 def test_a_half_sphere_bowl_under_a_white_sky_has_its_known_irradiance():
     """Between two points of a sphere the form factor is constant, dA / (4 pi R^2): from anywhere inside a half sphere
     half of the light is blocked, and one bounce returns albedo / 2 of what arrives: E = pi L / 2 (1 + albedo / 2)."""
-    surface = Surface(round_mesh(80.0, np.pi / 2, inward=True), plain())
+    surface = SyntheticSurface(round_mesh(80.0, np.pi / 2, inward=True), plain())
     irradiance = irradiance_of(surface, [constant_light((1, 1, 1))], [FRONT_SHOT], COARSE)[4:-4, :, 0]
     expected = 0.5 * np.pi * (1 + 0.5 * np.array(ALBEDO))
     np.testing.assert_allclose(irradiance.mean((0, 1)), expected, rtol=0.015)
@@ -116,7 +118,7 @@ def test_lobe_samples_integrate_to_the_directional_albedo():
 
 def test_gloss_of_a_lit_globe_matches_a_numeric_integral():
     light = EnvironmentLight(procedural_environment("studio", 3))
-    surface = Surface(round_mesh(80.0, np.pi, inward=False), plain())
+    surface = SyntheticSurface(round_mesh(80.0, np.pi, inward=False), plain())
     directions, solid_angle = hemisphere_quadrature(96, 192)
     rng = np.random.default_rng(0)
     samples = GlossSamples.draw(light, np.eye(3), 256, 256, rng)
@@ -142,11 +144,11 @@ def test_the_fast_renderer_agrees_with_brute_force():
     def radius(unit: np.ndarray) -> np.ndarray:
         return 80 * (1 + 0.18 * np.sin(5 * unit[:, 0]) * np.cos(6 * unit[:, 1]) * np.cos(4 * unit[:, 2] + 1))
 
-    surface = Surface(round_mesh(radius, np.pi, inward=False, count=32), plain(specular=0.8, roughness=0.45))
+    surface = SyntheticSurface(round_mesh(radius, np.pi, inward=False, count=32), plain(specular=0.8, roughness=0.45))
     light = EnvironmentLight(0.5 * procedural_environment("room", 1))
     turn = world_from_head(FRONT[None], "head")[0]
     quality = IrradianceQuality(size=96, directions=2048, lamp_samples=32, groups=8)
-    irradiance = irradiance_of(surface, [light], [Shot(FRONT, turn, 0, 1)], quality)[:, :, 0]
+    irradiance = irradiance_of(surface, [light], [SyntheticShot(FRONT, turn, 0, 1)], quality)[:, :, 0]
     rng = np.random.default_rng(2)
     faces = np.nonzero(surface.mesh.vertices[surface.mesh.faces].mean(1)[:, 2] > 30)[0]
     points = surface.points(rng.choice(faces, 150), np.full((150, 3), 1 / 3))
@@ -181,11 +183,11 @@ def test_a_chart_in_a_white_furnace_shows_its_reflectances():
     """Far from the head; close to a black globe each point loses what it covers of the sky: centred on the horizon
     with angular radius a, it projects to a circular segment of area a - sin a cos a of the unit disc."""
     light = constant_light()
-    surface = Surface(round_mesh(80.0, np.pi, inward=False, count=16), plain(albedo=(0.0, 0.0, 0.0)))
-    camera, dark = Camera(240, 160, 1000.0), np.zeros((8, 8, 3), np.float32)
-    shot = Shot(rigid(WORLD_FROM_CAMERA, np.array([-600.0, 0.0, 900.0])), np.eye(3), 0, 1)
+    surface = SyntheticSurface(round_mesh(80.0, np.pi, inward=False, count=16), plain(albedo=(0.0, 0.0, 0.0)))
+    camera, dark = PinholeCamera(240, 160, 1000.0), np.zeros((8, 8, 3), np.float32)
+    shot = SyntheticShot(rigid(WORLD_FROM_CAMERA, np.array([-600.0, 0.0, 900.0])), np.eye(3), 0, 1)
     picture = np.full((160, 240, 3), 0.5)
-    chart = Chart(rigid(np.eye(3), np.array([0.0, 0.0, 1000.0])))
+    chart = PlacedChart(rigid(np.eye(3), np.array([0.0, 0.0, 1000.0])))
     add_chart(picture, chart, surface, light, dark, shot, camera.intrinsics, 2)
     corners, _ = project(chart.points(CORNERS), np.eye(4), camera.intrinsics)
     view = read_chart(picture.astype(np.float32), 99.0, corners)
@@ -193,7 +195,7 @@ def test_a_chart_in_a_white_furnace_shows_its_reflectances():
     expected = np.maximum(reflectances(), 0.0) * [1, 2, 3]
     np.testing.assert_allclose(view.patches, expected, rtol=0.02, atol=0.004)
     assert (picture[:8] == 0.5).all()
-    near = Shot(rigid(WORLD_FROM_CAMERA, np.array([-170.0, 0.0, 1000.0])), np.eye(3), 0, 1)
+    near = SyntheticShot(rigid(WORLD_FROM_CAMERA, np.array([-170.0, 0.0, 1000.0])), np.eye(3), 0, 1)
     shaded = chart_irradiance(chart, surface, light, dark, near)[2, :, 0] / np.pi
     angle = np.arcsin(80.0 / (170.0 + 25.0 * np.linspace(-3, 3, 7)))
     np.testing.assert_allclose(shaded, 1.0 - (angle - np.sin(angle) * np.cos(angle)) / np.pi, atol=0.015)
@@ -202,9 +204,9 @@ def test_a_chart_in_a_white_furnace_shows_its_reflectances():
 def test_the_result_does_not_depend_on_the_number_of_processes():
     mesh = round_mesh(80.0, np.pi, inward=False, count=12)
     scene = Scene(mesh, plain(), (procedural_environment("room", 0, 16),))
-    shots = [Shot(FRONT, np.eye(3), 0, seed) for seed in range(3)]
+    shots = [SyntheticShot(FRONT, np.eye(3), 0, seed) for seed in range(3)]
     quality = RenderQuality(IrradianceQuality(32, 64, 4, 3), PictureQuality(1, 2, 2), 0)
-    first, second = (list(render(scene, shots, Camera(32, 32, 150.0), quality, [True, False, False], processes))
+    first, second = (list(render(scene, shots, PinholeCamera(32, 32, 150.0), quality, [True, False, False], processes))
                      for processes in (1, 2))
     assert set(first[0]) > {"radiance", "albedo", "normal", "depth", "mask", "head"} and set(first[1]) == {"radiance"}
     for a, b in zip(first, second, strict=True):

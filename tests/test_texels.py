@@ -29,7 +29,7 @@ def test_blocks_show_what_the_whole_does():
     blocks = frame.blocks()
     assert len(blocks) == 2 and np.array_equal(np.concatenate(blocks), frame.rows)
     parts, values = zip(*(surface.samples(frame, rows) for rows in blocks), strict=True)
-    for name in ("rows", "colours", "weight", "limits"):
+    for name in ("rows", "colours", "weight", "saturation"):
         joined = np.concatenate([getattr(part, name) for part in parts])
         np.testing.assert_allclose(joined, getattr(whole, name), atol=1e-6)
     np.testing.assert_array_equal(np.concatenate(values), places)
@@ -41,7 +41,7 @@ def test_samples_lie_where_the_pinhole_camera_sees_them():
     ramp = np.stack(np.meshgrid(np.arange(400) + 0.5, np.arange(400) + 0.5), axis=-1)
     picture = np.concatenate([ramp, np.zeros((400, 400, 1))], axis=2).astype(np.float32)
     ramped = prepare_picture(np.full((400, 400, 3), 128, np.uint8), picture, np.full((400, 400), 255, np.uint8))
-    samples, places = surface.samples(FrameView(frame.rows, frame.table, ramped, frame.limits, frame.focal_length))
+    samples, places = surface.samples(FrameView(frame.rows, frame.table, ramped, frame.saturation, frame.focal_length))
     expected = 900.0 * places[:, :2] * [1.0, -1.0] / (600.0 - places[:, 2:]) + 200.0
     np.testing.assert_allclose(samples.colours[:, :2], expected, atol=0.15)
 

@@ -11,7 +11,7 @@ from shared.atlas import BORDER_TEXELS, PlacedFrame, build_atlas, place_frame, s
 from shared.geometry import project, rigid, rotation_from_vector
 from shared.raycast import RayScene, camera_hits
 from shared.robust import ROBUST_SCALE
-from shared.texture_tracks import LEAST_SPREAD, MeanTexture, Windows, mean_texture, track_frame
+from shared.texture_tracks import LEAST_SPREAD, MeanContrast, Windows, mean_texture, track_frame
 
 LENS = np.array([[900.0, 0, 120], [0, 900.0, 120], [0, 0, 1]])
 SIZE = 240
@@ -227,7 +227,7 @@ def test_windows_that_a_frame_hides_or_mostly_hides_are_not_tracked(atlas, textu
 
 
 def test_windows_without_texture_are_not_tracked(atlas):
-    flat = MeanTexture(np.full((180, 180), 128, np.float32), np.ones((180, 180), np.float32), np.ones((180, 180)))
+    flat = MeanContrast(np.full((180, 180), 128, np.float32), np.ones((180, 180), np.float32), np.ones((180, 180)))
     found, _ = track_frame(atlas, flat, render(pose_of(), skin(), NOISE), placed_at(atlas, pose_of()), WINDOWS)
     assert np.isnan(found).all()
 
@@ -235,7 +235,7 @@ def test_windows_without_texture_are_not_tracked(atlas):
 def test_skin_that_no_frame_of_the_mean_saw_is_not_tracked(atlas, texture):
     seen = texture.seen.copy()
     seen[:, :90] = 0
-    unseen = MeanTexture(texture.mean, texture.spread, seen)
+    unseen = MeanContrast(texture.mean, texture.spread, seen)
     found, _ = track_frame(atlas, unseen, render(pose_of(), skin(), NOISE), placed_at(atlas, pose_of()), WINDOWS)
     assert np.isnan(found[atlas.columns < 80]).all()
     assert np.isfinite(found[atlas.columns > 105]).mean() > 0.85

@@ -19,7 +19,7 @@ from tools.goldens.tiny import TINY_SUBJECT
 from tools.score import camera_intrinsics, score
 from tools.tradeoff_cases import ABLATIONS, GROUPS, PEER, PRESET, QUICK, ChartCase, all_cases, chosen_cases
 from tools.tradeoff_rows import Rows, csv_row, higher_is_better, pareto_front, row_costs, summarise
-from tools.tradeoff_runs import Cost, Runs, Solved, fingerprints, measured
+from tools.tradeoff_runs import ProcessCost, Runs, Solved, fingerprints, measured
 from tools.tradeoff_scores import flat, scores_of
 
 CLIP = {"frames": 48, "height": 400}
@@ -123,8 +123,9 @@ def test_a_stage_that_fails_says_why_and_leaves_the_earlier_ones(toy, monkeypatc
 
 # ---------------------------------------------------------------- the table
 def solved(seconds, digest="d0"):
-    costs = {"sample_frames": Cost(5.0, 6.0, 100.0, 0.5), "inverse_render": Cost(seconds, 2 * seconds, 900.0, 0.0),
-             "export_usd": Cost(7.0, 7.0, 1500.0, 0.0)}  # fmt: skip
+    costs = {"sample_frames": ProcessCost(5.0, 6.0, 100.0, 0.5),
+             "inverse_render": ProcessCost(seconds, 2 * seconds, 900.0, 0.0),
+             "export_usd": ProcessCost(7.0, 7.0, 1500.0, 0.0)}  # fmt: skip
     return Solved(None, digest, costs, fingerprints(["tools/tradeoff_rows.py"]))
 
 
@@ -155,7 +156,7 @@ def test_a_peer_is_measured_when_all_its_seconds_are(rows):
     case = ChartCase("Mitsuba", PEER, "draft", seconds=(60.0, 120.0))
     for at in case.seconds:
         assert not rows.has(case, 0, 2)
-        rows.add(case, 0, 2, Solved(None, f"m{at}", {"Mitsuba": Cost(at, at, 1.0, 0.0)}, {}, at), {ERROR: 3.0})
+        rows.add(case, 0, 2, Solved(None, f"m{at}", {"Mitsuba": ProcessCost(at, at, 1.0, 0.0)}, {}, at), {ERROR: 3.0})
     assert rows.has(case, 0, 2) and rows.rows[-1]["case"] == "Mitsuba, 120 s"
 
 

@@ -6,11 +6,11 @@ from toy_tradeoff import ERROR, POINTS
 
 from tools.tradeoff_cases import GROUPS
 from tools.tradeoff_page import tradeoff_page
-from tools.tradeoff_svg import Scale, log_ticks, tradeoff_svg
+from tools.tradeoff_svg import Axis, log_ticks, tradeoff_svg
 
 
 def test_the_axis_is_logarithmic():
-    scale = Scale(1.0, 1000.0, 0.0, 300.0, logarithmic=True)
+    scale = Axis(1.0, 1000.0, 0.0, 300.0, logarithmic=True)
     assert [round(scale(value)) for value in (1, 10, 100, 1000, 5000)] == [0, 100, 200, 300, 300]
     assert log_ticks(3.0, 60.0) == [5.0, 10.0, 20.0, 50.0]
 

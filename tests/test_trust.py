@@ -16,7 +16,7 @@ from toy_runs import REPOSITORY, copy_pipeline, limn, make_subject
 from shared.contract.cli import parse_request
 from shared.contract.folders import RunFolder
 from shared.contract.hashing import HashMemory, hash_file
-from shared.contract.needs import Scale, measured_scale
+from shared.contract.needs import WorkSize, measured_scale
 from shared.contract.source import read_declaration
 from shared.contract.wording import read_yaml
 from shared.errors import InputError
@@ -98,7 +98,7 @@ def test_no_command_reaches_through_links(tmp_path, tmp_path_factory, pipeline, 
 def test_planted_sizes_are_no_sizes(tmp_path):
     folder = tmp_path / "work" / "clips" / "x" / "work" / "sample_frames"
     folder.mkdir(parents=True)
-    expected = Scale(10, 20, 30)
+    expected = WorkSize(10, 20, 30)
     for size in ([1e200, 1e200], [1e999, 1], [-1, -1], [0, 5], [10**400, 1], "ab", {}, None, [[], []]):
         (folder / "frames.json").write_text(json.dumps({"size": size, "frames": []}))
         assert measured_scale(tmp_path, expected) == expected, size

@@ -12,8 +12,8 @@ from shared.io.images import read_exr
 from shared.io.meshes import load_mesh
 from shared.solve.capture import Sizes
 from shared.solve.views import (
-    Camera,
     HeadViews,
+    ViewCamera,
     clip_light,
     frontal_frame,
     light_in_head_space,
@@ -145,7 +145,7 @@ def test_agrees_with_the_solvers_own_render(tiny_run):
     expected = read_exr(solved / "renders" / f"{index[frame]:06d}.exr")
     maps = {name: read_exr(solved / "maps" / f"{name}.exr") for name in (
         "diffuse_albedo", "specular_intensity", "roughness")}
-    camera = Camera(poses_rendered[frame], poses["intrinsics_crop"], expected.shape[1::-1])
+    camera = ViewCamera(poses_rendered[frame], poses["intrinsics_crop"], expected.shape[1::-1])
     light = clip_light(read_exr(solved / "envmap.exr"), poses_rendered, "head")
     found = HeadViews(load_mesh(solved / "mesh.npz"), maps).render(light, [camera])[0]
     both = ((expected > 0).all(-1) & (found > 0).all(-1)).astype(np.uint8)

@@ -9,17 +9,17 @@ from shared.brdf import hemispherical_albedo
 from shared.envmap import cube_directions
 from shared.gather import Samples
 from shared.geometry import camera_centres, fibonacci_sphere, rigid, rotation_from_vector, world_from_head
-from shared.lobes import LobeTable, specular_reflection
+from shared.lobes import SpecularTransfer, specular_reflection
 from shared.mesh import normalised
 from shared.raycast import RayScene
 from shared.shading import light_along
-from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.appearance import AppearanceSettings, AppearanceSolver
 from shared.solve.capture import Capture
 from shared.transfer import bounce_nodes, irradiance, mesh_points, node_radiosity, trace_transfer
 
 FRAMES, ROUGHNESS, SPECULAR, NOISE = 14, 0.4, 0.7, 0.002
 DIRECTIONS = fibonacci_sphere(256)
-MATTE = Settings(resolutions=(6,), steps=4, specular=False, noise=(0.003, 0.01))
+MATTE = AppearanceSettings(resolutions=(6,), steps=4, specular=False, noise=(0.003, 0.01))
 
 
 def true_light(directions):
@@ -92,7 +92,7 @@ def make_truth(
     flat = along.reshape(len(DIRECTIONS), -1), radiosity.reshape(len(direct), -1)
     light = irradiance(transfer, *flat).reshape(len(points), frames, 3)
     towards = normalised(camera_centres(poses)[None] - points.positions[:, None])
-    table = LobeTable(points.normals, transfer.visibility(), DIRECTIONS)
+    table = SpecularTransfer(points.normals, transfer.visibility(), DIRECTIONS)
     roughness = roughness_at(points.positions)
     lobes = [specular_reflection(table, towards[:, f], roughness, along[:, f]) for f in range(frames)]
     albedo = true_albedo(points.positions)
@@ -100,8 +100,8 @@ def make_truth(
     colours += noise * np.random.default_rng(0).normal(size=colours.shape)
     cosine = (towards * points.normals[:, None]).sum(2)
     weight = np.where(cosine > 0.2, cosine**2, 0.0).astype(np.float32)
-    limits = (colours > clip_at).astype(np.int8)
-    samples = Samples(np.clip(colours, 0, clip_at).astype(np.float32), weight, limits, towards.astype(np.float32))
+    saturation = (colours > clip_at).astype(np.int8)
+    samples = Samples(np.clip(colours, 0, clip_at).astype(np.float32), weight, saturation, towards.astype(np.float32))
     fitted, skin = np.tile(np.arange(FRAMES) % 5 != 2, len(lights)), np.ones(len(points), bool)
     capture = Capture(
         points, samples, transfer, nodes, node_transfer, DIRECTIONS, turns, fitted, skin, light_index=light_index
@@ -123,7 +123,7 @@ def solver_of(capture, settings=MATTE):
 
 def solver_under_true_light(capture):
     """All unknowns but the roughness as they are; baked."""
-    solver = AppearanceSolver(capture, Settings(resolutions=(16,), noise=(0.003, 0.01), roughness=ROUGHNESS))
+    solver = AppearanceSolver(capture, AppearanceSettings(resolutions=(16,), noise=(0.003, 0.01), roughness=ROUGHNESS))
     solver.state.params, solver.state.specular = np.log(true_light(cube_directions(16))), SPECULAR
     solver.state.node_albedo = true_albedo(capture.nodes.points.positions)
     solver.state.albedo = true_albedo(capture.points.positions)

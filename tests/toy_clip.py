@@ -13,7 +13,7 @@ from shared.gather import prepare_picture
 from shared.geometry import rigid, rotation_from_vector
 from shared.mesh import Mesh
 from shared.solve.capture import Sizes
-from shared.solve.views import Camera, HeadViews
+from shared.solve.views import HeadViews, ViewCamera
 
 FRAMES, SIZE, MAP = 9, (64, 64), 32
 LENS = np.array([[230.0, 0, 32], [0, 230.0, 32], [0, 0, 1]])
@@ -60,7 +60,7 @@ def toy_clip():
     angle = np.linspace(-0.6, 0.6, FRAMES)
     vectors = np.stack([0.15 * np.sin(5 * angle), angle, 0 * angle], axis=1)
     poses = rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors), np.tile([0.0, 0, 900.0], (FRAMES, 1)))
-    cameras = [Camera(pose, LENS, SIZE) for pose in poses]
+    cameras = [ViewCamera(pose, LENS, SIZE) for pose in poses]
     views = HeadViews(mesh, true_maps(), Sizes(directions=512, nodes=60), cameras)
     light = latlong_from_cube(true_light(), 64)
     pictures = []

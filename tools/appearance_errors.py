@@ -18,7 +18,7 @@ from shared.render import SurfaceMaps, render_frame
 from shared.solve.inverse_problem import InverseResult
 from shared.texture import sample_bilinear
 from tools import score_measures
-from tools.score_buffers import SurfaceViewer as BufferViewer
+from tools.score_buffers import BufferRenderer as BufferViewer
 
 CONFIDENT = 0.5
 RENDERED_FRAMES = 6

@@ -35,7 +35,7 @@ from shared.solve.inverse import solve_clip
 from shared.solve.inverse_parameters import read_settings
 from shared.solve.inverse_problem import InverseResult, InverseSettings
 from shared.solve.joint_clips import join_clips
-from shared.texture_match import MeanTexture
+from shared.texture_match import ClipTexture
 from stages.inverse_render import STAGE
 from tools.appearance_errors import light_errors, map_errors, render_errors
 from tools.bench_relight import relight_errors
@@ -82,7 +82,7 @@ def measure(
     clips: Sequence[ClipInputs],
     changes: dict,
     note: Callable,
-    textures: Sequence[MeanTexture] = (),
+    textures: Sequence[ClipTexture] = (),
 ) -> tuple[dict, object]:
     """Solves one case and compares it with the truth of each clip's subject -> scores and the result."""
     start = time.perf_counter()
@@ -90,8 +90,8 @@ def measure(
     inputs = join_clips(clips, textures) if len(clips) > 1 else clips[0]
     if len(clips) > 1:
         note(f"clips in one head space: {inputs.describe()}")
-    sights = inputs.chart_sights() if params.chart else ()
-    result = solve_clip(inputs, read_settings(params), silent, note, sights)
+    observations = inputs.chart_observations() if params.chart else ()
+    result = solve_clip(inputs, read_settings(params), silent, note, observations)
     scores = {"seconds": time.perf_counter() - start}
     scores["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     placed = [replace(clip, camera_from_head=inputs.camera_from_head[inputs.light_index == k])

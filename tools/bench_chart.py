@@ -15,20 +15,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from shared.chart import ChartSight
+from shared.chart import ChartObservation
 from shared.chart_watch import ChartWatch
 from shared.contract.chart_place import AUTO
 from shared.envmap import cube_from_latlong
 from shared.geometry import rigid, rotation_from_vector
 from shared.io.models import load_head_model
 from shared.solve.chart_scale import state_chart
-from tools.synth_camera import Camera
-from tools.synth_chart import Chart, add_chart
+from tools.synth_camera import PinholeCamera
+from tools.synth_chart import PlacedChart, add_chart
 from tools.synth_head import Head, random_head
 from tools.synth_light import ENVIRONMENTS, EnvironmentLight
 from tools.synth_output import sensor_codes
-from tools.synth_surface import Materials, Surface
-from tools.synthesize import PRESETS, SENSOR_MM, Settings, camera_place, light_of, plan_shots
+from tools.synth_surface import Materials, SyntheticSurface
+from tools.synthesize import PRESETS, SENSOR_MM, SynthesisSettings, camera_place, light_of, plan_shots
 
 SIZE, LIGHT_RESOLUTION, EXPOSURE = (960, 480), 16, 0.8
 SKIN, SKIN_IRRADIANCE = np.array([0.3, 0.2, 0.15], np.float32), 0.5
@@ -36,17 +36,17 @@ BESIDE_MM, ABOVE_MM, BEHIND_MM = (175.0, 235.0), (-50.0, 70.0), (-130.0, 60.0)
 LARGEST_TILT_DEG = np.array([25.0, 35.0, 40.0])
 
 
-def random_chart(distance_mm: float, height_mm: float, rng: np.random.Generator) -> Chart:
+def random_chart(distance_mm: float, height_mm: float, rng: np.random.Generator) -> PlacedChart:
     """A chart somewhere to the left or right of the head, turned away from the camera by up to LARGEST_TILT_DEG."""
     beside = rng.choice([-1.0, 1.0]) * rng.uniform(*BESIDE_MM)
     place = np.array([beside, height_mm - rng.uniform(*ABOVE_MM), distance_mm + rng.uniform(*BEHIND_MM)])
     nod, turn, roll = np.diag(np.radians(rng.uniform(-1.0, 1.0, 3) * LARGEST_TILT_DEG))
     facing = np.array([0.0, np.arctan2(place[0], place[2]), 0.0])
     turns = [rotation_from_vector(angle) for angle in (facing + turn, nod, roll)]
-    return Chart(rigid(turns[0] @ turns[1] @ turns[2], place))
+    return PlacedChart(rigid(turns[0] @ turns[1] @ turns[2], place))
 
 
-def head_of(seed: int) -> tuple[Head, Settings]:
+def head_of(seed: int) -> tuple[Head, SynthesisSettings]:
     """A random head and the settings that place it before the camera."""
     return random_head(load_head_model(), seed, False), replace(PRESETS["demo"], size=SIZE[1], seed=seed, chart=True)
 
@@ -55,10 +55,10 @@ def measure(light: str, places: int, seed: int) -> np.ndarray:
     """[N, 2, 3] error of the log factor and the deviation that it states, of the N charts that were used."""
     head, settings = head_of(seed)
     one = np.ones((4, 4), np.float32)
-    surface = Surface(head.mesh, Materials(one[..., None] * SKIN, one, one, one))
+    surface = SyntheticSurface(head.mesh, Materials(one[..., None] * SKIN, one, one, one))
     environment = light_of(light, settings)
     truth, shots = EXPOSURE * cube_from_latlong(environment, LIGHT_RESOLUTION), plan_shots(head, settings)
-    camera = Camera(*SIZE, settings.focal_mm / SENSOR_MM * settings.size)
+    camera = PinholeCamera(*SIZE, settings.focal_mm / SENSOR_MM * settings.size)
     rng = np.random.default_rng([seed, *light.encode()])
     said = []
     for k in range(places):
@@ -69,8 +69,8 @@ def measure(light: str, places: int, seed: int) -> np.ndarray:
         watch = ChartWatch(AUTO, "srgb")
         watch.expect(1)
         watch.look(0, 0, sensor_codes(EXPOSURE * picture, settings.noise, k))
-        sights = [ChartSight.from_record(record, (0.0, 0.0, 1.0), np.zeros(1)) for record in watch.record()]
-        statement, _ = state_chart(sights, surface.scene, shot.camera_from_head[None], camera.intrinsics, "head")
+        observations = [ChartObservation.from_record(record, (0.0, 0.0, 1.0), np.zeros(1)) for record in watch.record()]
+        statement, _ = state_chart(observations, surface.scene, shot.camera_from_head[None], camera.intrinsics, "head")
         if statement is not None:
             factor, covariance = statement.log_factor(truth, EXPOSURE * SKIN_IRRADIANCE * SKIN)
             said.append(np.stack([factor, np.sqrt(np.diag(covariance))]))

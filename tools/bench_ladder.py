@@ -1,12 +1,12 @@
-"""The ladder of models against its fixed rungs: error on held-out frames and CPU seconds, over several clips.
+"""Model selection of models against its fixed candidates: error on held-out frames and CPU seconds, over several clips.
 
-    python -m tools.bench_ladder RUN [RUN ...] --out TABLE.csv [--set key=value ...] [--rungs auto cubemap_16 ...]
+    python -m tools.bench_ladder RUN [RUN ...] --out TABLE.csv [--set key=value ...] [--candidates auto cubemap_16 ...]
 
 RUN: a run's folder whose work/ holds sample_frames and track_landmarks. Light and mesh are solved with model=auto and
 with each fixed model, without the outline and the texture pass, which all share. Every fixed model counts twice, with
 the tracked mesh and with the refined one. Rows that TABLE.csv holds already are kept, so that an interrupted table goes
-on. At the end, for each clip: the ladder's error and seconds relative to those of the fixed rung with the least error
-(mean absolute, by which the ladder chooses; beside it the root mean square relative to the least one).
+on. At the end, for each clip: model selection's error and seconds relative to those of the fixed candidate with the
+least error (mean absolute, by which model selection chooses; beside it the root mean square relative to the least one).
 
 CPU seconds of one thread: on a machine that others use too, the clock on the wall says little.
 """
@@ -26,14 +26,14 @@ from shared.gather import SurfaceViewer
 from shared.geometry import fibonacci_sphere
 from shared.io.clip_inputs import ClipInputs, read_inputs
 from shared.lobe_tables import specular_tables
-from shared.lobes import LobeTable
+from shared.lobes import SpecularTransfer
 from shared.solve.fit_appearance import Solution
 from shared.solve.inverse_problem import frames_to_fit
 from shared.solve.light_and_mesh import solve_light
 from tools.bench_appearance import settings_of, silent
 
 LEAST = {"visibility": False, "specular": False, "light_model": "harmonics_2"}
-RUNGS: dict[str, dict] = {
+CANDIDATES: dict[str, dict] = {
     "auto": {"model": "auto", "light_resolution": 32},
     "least": LEAST,
     "harmonics_2": {"light_model": "harmonics_2"},
@@ -68,34 +68,34 @@ class Clock:
 
 
 def compile_loops() -> None:
-    """What is compiled at its first call must not count as the first rung's time."""
+    """What is compiled at its first call must not count as the first candidate's time."""
     up, directions = np.array([[0.0, 0.0, 1.0]], np.float32), fibonacci_sphere(64)
-    table = LobeTable(up, np.ones((1, 64), bool), directions)
+    table = SpecularTransfer(up, np.ones((1, 64), bool), directions)
     specular_tables(table, up[:, None], 0.5)
     specular_tables(table, up[:, None], np.array([0.5]))
 
 
-def measure(inputs: ClipInputs, clip: str, rung: str, given: dict) -> list[dict]:
-    """The table's rows of one rung on one clip: of a fixed one with the tracked mesh and with the refined one."""
-    settings, clock = settings_of({**given, **RUNGS[rung]}), Clock()
+def measure(inputs: ClipInputs, clip: str, candidate: str, given: dict) -> list[dict]:
+    """The table's rows of one candidate on one clip: of a fixed one with the tracked mesh and with the refined one."""
+    settings, clock = settings_of({**given, **CANDIDATES[candidate]}), Clock()
     viewer = SurfaceViewer.of(inputs.mesh)
     fitted = frames_to_fit(inputs, settings, viewer)
-    lit = solve_light(inputs, settings, viewer, fitted, None, clock.progress, print if rung == "auto" else silent)
+    lit = solve_light(inputs, settings, viewer, fitted, None, clock.progress, print if candidate == "auto" else silent)
     seconds, appearance, shape = clock.seconds(), lit.settings.appearance, lit.shape_record
     facts = {
         "clip": clip,
-        "rung": rung,
+        "rung": candidate,
         "light": f"{appearance.light_model} {appearance.resolutions[-1]}",
         "visibility": "bounces" if appearance.bounce and appearance.visibility else appearance.visibility,
         "specular": appearance.specular,
     }
     judged = ~lit.capture.fitted
-    if rung == "auto":
-        facts["chosen"] = " > ".join(f"{row['part']} {row['rung']}" for row in lit.rungs if row["climbed"])
+    if candidate == "auto":
+        facts["chosen"] = " > ".join(f"{row['part']} {row['rung']}" for row in lit.candidates if row["climbed"])
     rows = [{**facts, "mesh": "refined" if shape["refined"] else "tracked", **errors_of(lit.solution, judged),
              "cpu_s": seconds}]
     if lit.tracked is not None:
-        rows[0]["mesh"] = "refined"  # or what was tried in vain: that, too, is what this rung costs
+        rows[0]["mesh"] = "refined"  # or what was tried in vain: that, too, is what this candidate costs
         rows.insert(0, {**facts, "mesh": "tracked", **errors_of(lit.tracked, judged), "cpu_s": clock.tracked})
     return rows
 
@@ -106,7 +106,7 @@ def errors_of(solution: Solution, judged: np.ndarray) -> dict:
 
 
 def compare(rows: Sequence[dict]) -> list[dict]:
-    """Per clip: the best fixed rung, and error and seconds of the ladder relative to its."""
+    """Per clip: the best fixed candidate, and error and seconds of model selection relative to its."""
     result = []
     for clip in dict.fromkeys(row["clip"] for row in rows):
         own = [row for row in rows if row["clip"] == clip]
@@ -147,21 +147,21 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="*", type=Path)
     parser.add_argument("--out", type=Path, required=True, help="the table")
-    parser.add_argument("--rungs", nargs="*", default=list(RUNGS), choices=RUNGS)
-    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="parameters for every rung")
+    parser.add_argument("--candidates", nargs="*", default=list(CANDIDATES), choices=CANDIDATES)
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="parameters for every candidate")
     options = parser.parse_args(arguments)
     given = dict(setting.split("=", 1) for setting in options.set)
     rows = read_rows(options.out)
     compile_loops()
     for run in options.runs:
         inputs = read_inputs(run / "work" / "sample_frames", run / "work" / "track_landmarks")
-        for rung in options.rungs:
-            if any(row["clip"] == run.name and row["rung"] == rung for row in rows):
+        for candidate in options.candidates:
+            if any(row["clip"] == run.name and row["rung"] == candidate for row in rows):
                 continue
-            rows += measure(inputs, run.name, rung, given)
+            rows += measure(inputs, run.name, candidate, given)
             write_rows(options.out, rows)
-            for row in [row for row in rows if (row["clip"], row["rung"]) == (run.name, rung)]:
-                print(run.name, rung, f"{row['mesh']} {row['held_out_abs']:.5f} {row['cpu_s']:.1f} s", flush=True)
+            for row in [row for row in rows if (row["clip"], row["rung"]) == (run.name, candidate)]:
+                print(run.name, candidate, f"{row['mesh']} {row['held_out_abs']:.5f} {row['cpu_s']:.1f} s", flush=True)
     compared = compare(rows)
     for row in compared:
         print(f"{row['clip']}: error {row['error_ratio']:.3f} (mean squares {row['square_ratio']:.3f}), "

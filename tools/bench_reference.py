@@ -187,8 +187,8 @@ def solve_transfer(options, clip: Clip, changes: dict, log: Log, label: str) -> 
         row = {"label": label, "solver": "transfer", "size": size}
         # What a process does but once, it does for each row: the loops' compilation counts.
         with ProcessPoolExecutor(1, get_context("spawn")) as alone:
-            given = options.subject, clip, TRANSFER_SIZES[size] | changes
-            log.add(row | alone.submit(_transfer_row, *given).result())
+            task = alone.submit(_transfer_row, options.subject, clip, TRANSFER_SIZES[size] | changes)
+            log.add(row | task.result())
 
 
 def _transfer_row(subject: Path, clip: Clip, changes: dict) -> dict:
@@ -232,8 +232,10 @@ def chart(log: Log, path: Path) -> None:
         known = np.log10([row["seconds"] for row in own])
         errors = [row["delta_e2000_median"] for row in own]
         curves[label] = np.interp(np.log10(times), known, errors, left=np.nan, right=np.nan)
-    title = {"x_label": "processor seconds (power of ten)", "y_label": "albedo, median dE2000"}
-    save_line_chart(path, np.log10(times), curves, **title, from_zero=True)
+    save_line_chart(
+        path, np.log10(times), curves, x_label="processor seconds (power of ten)", y_label="albedo, median dE2000",
+        from_zero=True,
+    )
     transfer = [row for row in rows if row["solver"] == "transfer"]
     for label in labels:
         own = [row for row in rows if row["label"] == label and row["solver"] == "reference"]

@@ -11,7 +11,7 @@ from shared.envmap import cube_from_latlong
 from shared.io.arrays import load_arrays
 from shared.io.images import read_exr, read_png
 from shared.render import SurfaceMaps, render_frame
-from shared.solve.capture import set_scenery
+from shared.solve.capture import precompute_transfer
 from shared.solve.inverse_problem import InverseResult, InverseSettings, shade_vertices
 from shared.solve.light_models import LogLight
 from tools import score_measures
@@ -51,7 +51,7 @@ def relight_errors(
     intrinsics = camera_intrinsics(subject)
     maps = SurfaceMaps(result.maps["diffuse_albedo"], result.maps["specular_intensity"])
     sizes = replace(settings.sizes, directions=RELIGHT_DIRECTIONS)
-    scenery = set_scenery(viewer, sizes, settings.appearance.visibility)
+    precomputed = precompute_transfer(viewer, sizes, settings.appearance.visibility)
     scores = {}
     for path in sorted((subject / "relight").glob("*_envmap.exr")):
         name = path.name.removesuffix("_envmap.exr")
@@ -61,7 +61,7 @@ def relight_errors(
         )
         solution = replace(result.solution, state=state)
         clip = _RelitClip(poses)
-        shading = shade_vertices(clip, settings.appearance, viewer, scenery, solution, lambda items, label: items)
+        shading = shade_vertices(clip, settings.appearance, viewer, precomputed, solution, lambda items, label: items)
         pairs = []
         for f, view in enumerate(views):
             mask = read_png(subject / "relight" / f"{name}_{view}_mask.png") > 127

@@ -28,14 +28,14 @@ from shared.envmap import cube_from_latlong, latlong_from_cube
 from shared.gather import SurfaceViewer
 from shared.io.images import write_exr
 from shared.io.models import load_head_model
-from shared.lobes import LobeTable, specular_reflection
+from shared.lobes import SpecularTransfer, specular_reflection
 from shared.mesh import Mesh, normalised, subdivide
 from shared.render import SurfaceMaps, render_frame
 from shared.shading import light_along
-from shared.solve.capture import Scenery, Sizes, face_front, set_scenery
+from shared.solve.capture import PrecomputedTransfer, Sizes, face_front, precompute_transfer
 from shared.solve.reference_raster import Raster
-from shared.solve.reference_shade import Sampling, Shader, Texture
-from shared.solve.views import Camera, orbit_camera
+from shared.solve.reference_shade import Sampling, Shader, TorchMaterial
+from shared.solve.views import ViewCamera, orbit_camera
 from shared.studio_lights import STUDIO_LIGHTS, studio_light
 from shared.transfer import Transfer, irradiance, mesh_points, node_radiosity
 from tools.peer_mitsuba import ALL_BOUNCES, DIRECT, ONE_BOUNCE, Coat, path_trace
@@ -69,34 +69,34 @@ class _Frame:
 
 
 @dataclass(frozen=True)
-class Stage:
+class TracedView:
     """A mesh before one camera under one light, traced once: what the transfer solver shades with."""
 
     viewer: SurfaceViewer
-    camera: Camera
-    scenery: Scenery
+    camera: ViewCamera
+    precomputed: PrecomputedTransfer
     index: np.ndarray
     transfer: Transfer
     along: np.ndarray
     latlong: np.ndarray
 
     @classmethod
-    def of(cls, mesh: Mesh, light: np.ndarray, pixels: int, sizes: Sizes = SIZES) -> Stage:
+    def of(cls, mesh: Mesh, light: np.ndarray, pixels: int, sizes: Sizes = SIZES) -> TracedView:
         """light: lat-long [H, 2 H, 3] in the mesh's space; both renderers see it through the same coarse cubemap."""
         viewer, camera = (
             SurfaceViewer.of(mesh),
             orbit_camera(mesh, YAW_DEG, PITCH_DEG, pixels),
         )
-        scenery = set_scenery(viewer, sizes)
+        precomputed = precompute_transfer(viewer, sizes)
         index = np.nonzero(face_front(viewer, camera.camera_from_head[None], -0.2))[0]
         cube = np.maximum(cube_from_latlong(light, LIGHT_RESOLUTION), 0.0)
-        along = light_along(cube, scenery.directions, np.eye(3)[None])[:, 0]
-        transfer = scenery.trace(mesh_points(mesh, index))
-        return cls(viewer, camera, scenery, index, transfer, along, latlong_from_cube(cube, LATLONG_ROWS, 1))
+        along = light_along(cube, precomputed.directions, np.eye(3)[None])[:, 0]
+        transfer = precomputed.trace(mesh_points(mesh, index))
+        return cls(viewer, camera, precomputed, index, transfer, along, latlong_from_cube(cube, LATLONG_ROWS, 1))
 
     def diffuse(self, albedo: Sequence[float], bounces: int) -> np.ndarray:
         """Picture [h, w, 3] of a matte surface: no bounce, one, or all of them (bounces 0, 1, 2)."""
-        nodes, colour = self.scenery.node_transfer, np.array(albedo)
+        nodes, colour = self.precomputed.node_transfer, np.array(albedo)
         direct = nodes.direct.astype(np.float64) @ self.along
         radiosity = [None, colour * direct, None][bounces]
         if bounces == 2:
@@ -107,7 +107,7 @@ class Stage:
     def specular(self, roughness: float, split: bool) -> np.ndarray:
         """Picture of the lobe alone at intensity 1: by the split sum or by the sum over directions."""
         points = mesh_points(self.viewer.mesh, self.index)
-        table = LobeTable(points.normals, self.transfer.visibility(), self.scenery.directions)
+        table = SpecularTransfer(points.normals, self.transfer.visibility(), self.precomputed.directions)
         table.narrowest = 2.0 if split else 0.0
         camera = self.camera.camera_from_head
         towards = normalised(-camera[:3, 3] @ camera[:3, :3] - points.positions)
@@ -123,7 +123,7 @@ class Stage:
         points = raster.points(vertices, normals, camera.camera_from_head, pixels, hits.face.ravel()[pixels])
         shader = Shader(PUBLISHED_RESOLUTION, Sampling(samples, samples, SPLIT_SAMPLES))
         even = torch.ones(len(pixels))
-        texture = Texture(
+        texture = TorchMaterial(
             torch.tensor(coat.albedo).expand(len(pixels), 3), coat.specular_intensity * even, coat.roughness * even
         )
         light = view(cube_from_latlong(self.latlong, PUBLISHED_RESOLUTION))
@@ -186,7 +186,7 @@ MESHES: dict[str, Callable[[], Mesh]] = {"head": head, "statue": statue}
 
 def measure(
     name: str,
-    stage: Stage,
+    stage: TracedView,
     samples: int,
     keep: Callable[[str, np.ndarray, np.ndarray], None],
     roughnesses: Sequence[float] = ROUGHNESSES,
@@ -224,8 +224,9 @@ def chart(path: Path, rows: list[dict]) -> None:
             own = [row for row in rows if (row["mesh"], row["quantity"]) == (mesh, way)]
             percent = np.array([100.0 * max(0.0, float(row["rms"])) for row in own])
             curves[f"{mesh}: {way.replace('_', ' ')}"] = np.where(percent < LARGEST_SHOWN, percent, np.nan)
-    options = {"x_label": "roughness", "y_label": "rms error of the highlight, %", "from_zero": True}
-    save_line_chart(path, ROUGHNESSES, curves, **options)
+    save_line_chart(
+        path, ROUGHNESSES, curves, x_label="roughness", y_label="rms error of the highlight, %", from_zero=True
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -253,7 +254,7 @@ def main(arguments: list[str] | None = None) -> int:
     rows = []
     for name in options.mesh:
         sizes = replace(SIZES, directions=options.directions)
-        stage = Stage.of(MESHES[name](), studio_light(options.light), options.pixels, sizes)
+        stage = TracedView.of(MESHES[name](), studio_light(options.light), options.pixels, sizes)
         own = measure(name, stage, options.samples, keep)
         for row in own:
             print(" ".join(f"{v:.4f}" if isinstance(v, float) else str(v) for v in row.values()), flush=True)

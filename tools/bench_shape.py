@@ -32,7 +32,7 @@ from shared.raycast import RayScene, camera_hits
 from shared.shape_pictures import shaded_picture, turned_camera
 from shared.solve.inverse import solve_clip
 from tools.bench_appearance import open_clip, settings_of, silent
-from tools.score import Result, camera_intrinsics, score_appearance, score_geometry, scored_frames
+from tools.score import ScoredResult, camera_intrinsics, score_appearance, score_geometry, scored_frames
 
 SMOOTHNESS = (1.0, 5.0, 19.0, 50.0, 200.0)
 COLUMNS = ("smoothness", "distance_median_mm", "distance_p95_mm", "normal_median_deg", "normal_p95_deg", "stopped",
@@ -45,7 +45,7 @@ def shape_errors(subject: Path, clip: ClipInputs, mesh: Mesh) -> dict[str, float
     gt_frames = load_arrays(subject / "gt" / "poses.npz")["gt_frames"]
     alignment, distance = _aligned(subject, clip, mesh)
     poses = dict(zip(clip.frame_index.tolist(), clip.camera_from_head, strict=True))
-    result = Result(subject, mesh, {}, poses, camera_intrinsics(subject))
+    result = ScoredResult(subject, mesh, {}, poses, camera_intrinsics(subject))
     rng = np.random.default_rng(0)
     normals = score_appearance(subject, result, scored_frames(gt_frames, result), alignment.rotation, rng)["normal_deg"]
     return {

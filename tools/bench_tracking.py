@@ -1,9 +1,9 @@
 """How tracking stands up to bad clips: a table of errors over perturbations of subjects with known truth.
 
-    python -m tools.bench_tracking SUBJECT... --out DIR [--spoil [--cases flicker,...]]
+    python -m tools.bench_tracking SUBJECT... --out DIR [--degrade [--cases flicker,...]]
     python -m tools.bench_tracking SUBJECT... --out DIR --backwards
 
-Runs sample_frames and track_landmarks on each subject as it is, and with --spoil on the spoilt copies of the first
+Runs sample_frames and track_landmarks on each subject as it is, and with --degrade on the degraded copies of the first
 (tools/perturb.py) as well. Writes DIR/tracking.csv and tracking.md. Rotations are compared after one common turn of
 the head, so that the mesh does not enter; the head's place across the view and in depth after the mesh's alignment, as
 tools.score does. `covered`: share of frames whose true rotation error lies within the 90 %
@@ -81,25 +81,25 @@ def measure(subject: Path, work: Path) -> dict[str, object]:
     }
 
 
-def spoilt_copies(subject: Path, tracked: Path, folder: Path) -> dict[str, Path]:
+def degraded_copies(subject: Path, tracked: Path, folder: Path) -> dict[str, Path]:
     """{case: subject}; made once, reused later."""
     frames = len(load_arrays(subject / "gt" / "poses.npz")["camera_from_head"])
     cases = {
-        name: lambda to, f=spoil: perturb.spoil_pixels(subject, to, f) for name, spoil in perturb.PIXELS.items()
+        name: lambda to, f=degrade: perturb.degrade_pixels(subject, to, f) for name, degrade in perturb.PIXELS.items()
     }
     cases |= {
-        name: lambda to, f=spoil: perturb.spoil_landmarks(subject, tracked, to, f)
-        for name, spoil in perturb.LANDMARKS.items()
+        name: lambda to, f=degrade: perturb.degrade_landmarks(subject, tracked, to, f)
+        for name, degrade in perturb.LANDMARKS.items()
     }
     cases |= {
-        "focal_10_longer": lambda to: perturb.spoil_focal(subject, to, 1.1),
-        "focal_10_shorter": lambda to: perturb.spoil_focal(subject, to, 0.9),
-        "backwards": lambda to: perturb.spoil_pixels(subject, to, perturb.unspoilt, slice(None, None, -1)),
+        "focal_10_longer": lambda to: perturb.degrade_focal(subject, to, 1.1),
+        "focal_10_shorter": lambda to: perturb.degrade_focal(subject, to, 0.9),
+        "backwards": lambda to: perturb.degrade_pixels(subject, to, perturb.unchanged, slice(None, None, -1)),
     }
     for step in (2, 4):
         if frames // step >= 12:
             order = slice(None, None, step)
-            cases[f"every_{step}"] = lambda to, s=order: perturb.spoil_pixels(subject, to, perturb.unspoilt, s)
+            cases[f"every_{step}"] = lambda to, s=order: perturb.degrade_pixels(subject, to, perturb.unchanged, s)
     for name, make in cases.items():
         if not (folder / name / "subject.yaml").exists():
             make(folder / name)
@@ -119,7 +119,7 @@ def both_ways(subject: Path, out: Path) -> dict[str, object]:
     """How far apart the poses are when the clip is tracked from either end. deviation_deg: what the stage reports."""
     backwards = out / "cases" / f"{subject.name}_backwards"
     if not (backwards / "subject.yaml").exists():
-        perturb.spoil_pixels(subject, backwards, perturb.unspoilt, slice(None, None, -1))
+        perturb.degrade_pixels(subject, backwards, perturb.unchanged, slice(None, None, -1))
     count = len(list((backwards / "frames").iterdir()))
     results, gains, deviation = [], [], 0.0
     for clip in (subject, backwards):
@@ -162,8 +162,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("subjects", nargs="+", type=Path, help="folders with subject.yaml and gt/")
     parser.add_argument("--out", required=True, type=Path)
-    parser.add_argument("--spoil", action="store_true", help="also the spoilt copies of the first subject")
-    parser.add_argument("--cases", default="", help="only these spoilt copies, by commas")
+    parser.add_argument("--degrade", action="store_true", help="also the degraded copies of the first subject")
+    parser.add_argument("--cases", default="", help="only these degraded copies, by commas")
     parser.add_argument("--backwards", action="store_true", help="compare with the clip run backwards; no truth needed")
     options = parser.parse_args(arguments)
     if options.backwards:
@@ -183,10 +183,10 @@ def main(arguments: list[str] | None = None) -> int:
     for subject in options.subjects:
         rows.append(bench(subject.resolve(), subject.resolve().name, options.out / "runs"))
         write_table(rows, options.out)
-    if options.spoil:
+    if options.degrade:
         first = options.subjects[0].resolve()
         tracked = options.out / "runs" / first.name / "work" / "track_landmarks"
-        copies = spoilt_copies(first, tracked, options.out / "cases")
+        copies = degraded_copies(first, tracked, options.out / "cases")
         wanted = options.cases.split(",") if options.cases else list(copies)
         for case in wanted:
             rows.append(bench(copies[case], case, options.out / "runs"))

@@ -27,7 +27,7 @@ class InputErrors(InputError):
 
 
 @dataclass(frozen=True)
-class Case:
+class SubjectCase:
     """One subject with the folder that its run goes to; or one clip of a subject that has several: clip is its name."""
 
     subject: Subject
@@ -39,10 +39,10 @@ class Case:
         """The subject's name."""
         return self.subject.name
 
-    def jobs(self, pipeline: Pipeline) -> list[tuple[Case, str]]:
+    def jobs(self, pipeline: Pipeline) -> list[tuple[SubjectCase, str]]:
         """What there is to do, in order: the case and the stage, where a case of several clips stands for the stages
         that work on all of them, and each clip is a case of its own for the others. Only what the pipeline wants."""
-        clips = [Case(clip, self.run.of_clip(clip.name), clip.name) for clip in self.subject.clips]
+        clips = [SubjectCase(clip, self.run.of_clip(clip.name), clip.name) for clip in self.subject.clips]
         joint = pipeline.joint if clips else pipeline.steps
         steps = [name for name in pipeline.steps if name in pipeline.wanted]
         return [(case, name) for case in clips for name in steps if name not in joint] + [
@@ -62,12 +62,12 @@ class Opened:
     """The subjects of a call. faults: (folder, what is wrong) of those that cannot be worked on. crashes: the same of
     those on which Limn itself failed."""
 
-    cases: list[Case] = field(default_factory=list)
+    cases: list[SubjectCase] = field(default_factory=list)
     faults: list[tuple[Path, InputError]] = field(default_factory=list)
     crashes: list[tuple[Path, str]] = field(default_factory=list)
 
     @contextlib.contextmanager
-    def attempt(self, case: Case) -> Iterator[None]:
+    def attempt(self, case: SubjectCase) -> Iterator[None]:
         """What goes wrong with one subject is kept for conclude(), so that it stops no other; traces go to stderr."""
         try:
             yield
@@ -90,10 +90,10 @@ class Opened:
         return 1 if self.crashes else 2 if self.faults else 0
 
 
-def no_access(case: Case, error: OSError) -> InputError:
+def no_access(case: SubjectCase, error: OSError) -> InputError:
     """What to say where the subject's files cannot be read or written."""
     return InputError("cannot be read or written", where=str(error.filename or case.run.root), got=error.strerror,
-                      mend="check permissions and disk, or write elsewhere with --out DIR")
+                      hint="check permissions and disk, or write elsewhere with --out DIR")
 
 
 def one_line(error: Exception) -> str:
@@ -107,7 +107,7 @@ def find_subjects(folders: Sequence[Path], list_file: Path | None = None) -> lis
     for folder in [*folders, *(_listed(list_file) if list_file else ())]:
         found += _subjects_in(folder) or [folder]
     if not found:
-        raise InputError("no subjects", mend="give folders with subject.yaml, a folder of such, or --list FILE")
+        raise InputError("no subjects", hint="give folders with subject.yaml, a folder of such, or --list FILE")
     return found
 
 
@@ -118,7 +118,7 @@ def _subjects_in(folder: Path) -> list[Path]:
     try:
         inside = sorted(folder.iterdir())
     except OSError as error:
-        raise InputError("cannot be read", where=str(folder), got=error.strerror, mend="check permissions") from error
+        raise InputError("cannot be read", where=str(folder), got=error.strerror, hint="check permissions") from error
     return [path for path in inside if _is_subject(path)]
 
 
@@ -146,11 +146,11 @@ def open_cases(folders: Sequence[Path], out: Path | None) -> Opened:
     for folder in folders:
         try:
             subject = load_subject(folder)
-            opened.cases.append(Case(subject, RunFolder.of(subject.folder, subject.name, out)))
+            opened.cases.append(SubjectCase(subject, RunFolder.of(subject.folder, subject.name, out)))
         except InputError as error:
             opened.faults.append((folder, error))
     roots = [case.run.root.resolve() for case in opened.cases]
-    twice = [InputError("given twice, or two subjects of one name", where=str(case.subject.folder), mend="rename one")
+    twice = [InputError("given twice, or two subjects of one name", where=str(case.subject.folder), hint="rename one")
              for i, case in enumerate(opened.cases) if roots[i] in set(roots[:i])]
     if twice:
         raise InputErrors(twice)

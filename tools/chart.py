@@ -55,7 +55,7 @@ def open_subject(folder: Path) -> Subject:
             raise InputError("could not be rendered", where=str(folder))
     subject = load_subject(folder)
     if not (folder / "gt").is_dir():
-        raise InputError("no ground truth", where=str(folder), expected="a gt/ folder", mend="see tools/synthesize.py")
+        raise InputError("no ground truth", where=str(folder), expected="a gt/ folder", hint="see tools/synthesize.py")
     return subject
 
 
@@ -68,7 +68,7 @@ def subject_key(subject: Subject, pipeline, work: Path) -> str:
     return hash_value(inputs | truth)
 
 
-class Chart:
+class ChartRun:
     """The measuring of one subject's cases, and its files in out."""
 
     def __init__(self, options: argparse.Namespace):
@@ -163,7 +163,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Exit code 0; 1 where a case failed; 2 when the input is at fault."""
     options = parser().parse_args(arguments)
     try:
-        chart = Chart(options)
+        chart = ChartRun(options)
         if options.list:
             for case in chart.cases:
                 done = sum(chart.rows.has(case, repeat, chart.threads) for repeat in range(options.repeats))

@@ -50,7 +50,7 @@ def blender_python() -> Path | None:
     if not value:
         return None
     if not Path(value).is_file():
-        raise InputError("no such interpreter", where=VARIABLE, got=value, mend="name the python that has bpy")
+        raise InputError("no such interpreter", where=VARIABLE, got=value, hint="name the python that has bpy")
     return Path(value)
 
 
@@ -135,10 +135,10 @@ def main() -> int:
     try:
         python = options.blender_python or blender_python()
         if python is None:
-            raise InputError("no Blender", where=VARIABLE, mend="give --blender-python, or set the variable")
+            raise InputError("no Blender", where=VARIABLE, hint="give --blender-python, or set the variable")
         rendered = sorted(int(path.stem) for path in (options.run / "export" / "renders").glob("*.exr"))
         if not rendered:
-            raise InputError("no re-renders", where=str(options.run / "export" / "renders"), mend="run limn run first")
+            raise InputError("no re-renders", where=str(options.run / "export" / "renders"), hint="run limn run first")
         frame = rendered[len(rendered) // 2] if options.frame is None else options.frame
         found = compare_render(options.run, python, frame, options.size, options.samples)
     except InputError as error:

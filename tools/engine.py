@@ -24,7 +24,7 @@ from shared.contract.manifest import write_record
 from shared.contract.needs import scale_of
 from shared.contract.pipeline import REPOSITORY, Pipeline
 from tools.booking import KINDS
-from tools.cases import Case
+from tools.cases import SubjectCase
 from tools.watch import Track, Watch
 
 SCRATCH = ".workflow-"
@@ -37,7 +37,7 @@ _CLUSTER_MB = 400
 
 
 @dataclass(frozen=True)
-class Settings:
+class EngineSettings:
     """How to run. parameters: {stage: {parameter: value}}. arguments: what hands them to each stage's command line.
 
     cores: in all, None for what a profile says. memory_mb: for all jobs together. threads: of one stage, None for an
@@ -74,7 +74,7 @@ def scratch_folder(run: RunFolder) -> Iterator[Path]:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def configure(scratches: Sequence[Path], cases: Sequence[Case], settings: Settings) -> list[list[Track]]:
+def configure(scratches: Sequence[Path], cases: Sequence[SubjectCase], settings: EngineSettings) -> list[list[Track]]:
     """Writes Snakemake's configuration into the first scratch folder; returns each subject's stages to watch."""
     pipeline, runs, tracks, home = settings.pipeline, {}, [], scratches[0]
     for case, scratch in zip(cases, scratches, strict=True):
@@ -91,7 +91,9 @@ def configure(scratches: Sequence[Path], cases: Sequence[Case], settings: Settin
     return tracks
 
 
-def _configure_case(case: Case, events: Path, settings: Settings, links: Path, first: int) -> tuple[dict, list[Track]]:
+def _configure_case(
+    case: SubjectCase, events: Path, settings: EngineSettings, links: Path, first: int
+) -> tuple[dict, list[Track]]:
     """{number: {stage: its command and the stamps that it waits for}} from the number first on, and what to watch.
 
     A number stands for the subject, or for one of its clips.
@@ -115,7 +117,7 @@ def _configure_case(case: Case, events: Path, settings: Settings, links: Path, f
     return runs, tracks
 
 
-def _command(name: str, case: Case, settings: Settings, events: Path) -> str:
+def _command(name: str, case: SubjectCase, settings: EngineSettings, events: Path) -> str:
     """The shell command of one stage."""
     pipeline = settings.pipeline
     command = [sys.executable, "-m", "shared.contract.launch", str(pipeline.root), pipeline.package, name,
@@ -127,7 +129,7 @@ def _command(name: str, case: Case, settings: Settings, events: Path) -> str:
     return shlex.join([*command, *settings.arguments[name]])
 
 
-def run_engine(home: Path, settings: Settings, watch: Watch, log: Path) -> bool:
+def run_engine(home: Path, settings: EngineSettings, watch: Watch, log: Path) -> bool:
     """Runs Snakemake to its end and shows the stages' events; False where the user interrupted it."""
     process = _start(home, settings, log)
     pause = _POLL_S + len(watch.tracks) / _TRACKS_PER_S
@@ -147,7 +149,7 @@ def run_engine(home: Path, settings: Settings, watch: Watch, log: Path) -> bool:
         process.wait()
 
 
-def _start(home: Path, settings: Settings, log: Path) -> subprocess.Popen:
+def _start(home: Path, settings: EngineSettings, log: Path) -> subprocess.Popen:
     """Snakemake, started in a process group of its own that dies with this process."""
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(Path(__file__).with_name("Snakefile")),
                "--directory", str(home), "--configfile", str(home / "config.json"), "--keep-going", "--nolock",

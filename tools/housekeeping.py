@@ -10,7 +10,7 @@ from pathlib import Path
 from shared.contract.folders import CLIPS, RunFolder
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
-from tools.cases import Case
+from tools.cases import SubjectCase
 from tools.cluster import LOG_SUFFIX
 from tools.gates import PICTURE, RECORD
 from tools.plan import StagePlan
@@ -50,11 +50,11 @@ def clean(run: RunFolder, pipeline: Pipeline, dry_run: bool) -> Iterator[str]:
     yield f"{run.work}: {readable_size(total)} {'to free' if dry_run else 'freed'}; export/ is kept"
 
 
-def report_path(case: Case, plans: Mapping[str, StagePlan]) -> tuple[Path, list[str]]:
+def report_path(case: SubjectCase, plans: Mapping[str, StagePlan]) -> tuple[Path, list[str]]:
     """The report and remarks about it; InputError where there is none."""
     path = case.run.root / "export" / "report.html"
     if not path.is_file():
-        raise InputError("no report yet", where=str(path.parent), mend=f"make it with: limn run {case.subject.folder}")
+        raise InputError("no report yet", where=str(path.parent), hint=f"make it with: limn run {case.subject.folder}")
     stale = [name for name, plan in plans.items() if plan.state != "current"]
     return path, [f"{case.name}: not up to date: {', '.join(stale)}"] if stale else []
 

@@ -25,6 +25,7 @@ import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 
+from shared.contract.cli import OneLineParser
 from shared.contract.confine import trust
 from shared.contract.declare import parameter_table
 from shared.contract.pipeline import Pipeline, load_pipeline, split_settings
@@ -35,11 +36,6 @@ from tools.cases import InputErrors, all_parameters, find_subjects, open_cases
 from tools.check_export import check_exports
 from tools.housekeeping import clean, report_path
 from tools.plan import plan_case, plan_lines
-
-
-class _OneLineParser(argparse.ArgumentParser):
-    def error(self, message: str) -> None:
-        raise InputError(message, mend=f"see {self.prog} --help")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -68,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """The command line of limn."""
-    parser = _OneLineParser(prog="limn", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = OneLineParser(prog="limn", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _input_command(commands, "validate", validate_command, "look at the inputs alone, in seconds, and write nothing")
     run = _subject_command(commands, "run", run_command, "do what is not done yet")
@@ -162,7 +158,7 @@ def validate_command(args: argparse.Namespace) -> int:
 def run_command(args: argparse.Namespace) -> int:
     """limn run"""
     from tools.booking import memory_to_give
-    from tools.engine import Settings
+    from tools.engine import EngineSettings
     from tools.gates import check_gates
     from tools.workflow import default_summary, run_cases
 
@@ -184,7 +180,7 @@ def run_command(args: argparse.Namespace) -> int:
     arguments = {name: always + [f"--set={key}={parameters[name][key] if (name, key) in files else value}"
                                  for key, value in given.get(name, {}).items()]
                  for name in pipeline.stages}
-    return run_cases(opened, Settings(
+    return run_cases(opened, EngineSettings(
         pipeline, parameters, arguments, args.out, cores, memory_mb, args.threads, args.profile,
         default_summary(args.subjects, args.out, args.summary, [case.run.root for case in opened.cases]), args.renew))
 

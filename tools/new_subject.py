@@ -57,7 +57,7 @@ def make_subject(new: NewSubject) -> tuple[Path, str]:
     name = re.sub(r"[^\w.-]+", "_", name).strip("._") or "subject"
     folder = Path(os.path.abspath(new.parent / name))
     if folder.exists():
-        raise InputError("the folder exists already", where=str(folder), mend="choose another with --name")
+        raise InputError("the folder exists already", where=str(folder), hint="choose another with --name")
     partial = folder.with_name(f".{name}.tmp-{os.getpid()}")
     partial.mkdir(parents=True)
     try:
@@ -68,7 +68,7 @@ def make_subject(new: NewSubject) -> tuple[Path, str]:
         partial.rename(folder)
     except InputError as error:
         raise InputError(error.what, where=error.where.replace(str(partial), str(folder)), got=error.got,
-                         expected=error.expected, mend=error.mend) from error
+                         expected=error.expected, hint=error.hint) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return folder, f"{info.width} x {info.height}, {info.frame_count} frames at {info.fps:g} frames a second"

@@ -11,7 +11,7 @@ from shared.contract.disk import FULL_BELOW_BYTES, free_bytes
 from shared.contract.manifest import LOG, write_record
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
-from tools.cases import Case
+from tools.cases import SubjectCase
 from tools.gates import PICTURE, Flag, judge
 from tools.plan import CURRENT, StagePlan, kept_lines
 from tools.records import read_cost
@@ -57,7 +57,7 @@ def at_fault(folder: Path, error: InputError | str, state: str = "input error", 
     return Outcome(name, str(folder), state, reason=str(error), log=log)
 
 
-def outcome_of(case: Case, pipeline: Pipeline, plans: Mapping[str, StagePlan], tracks: Sequence[Track] = (),
+def outcome_of(case: SubjectCase, pipeline: Pipeline, plans: Mapping[str, StagePlan], tracks: Sequence[Track] = (),
                interrupted: bool = False, engine_log: Path | None = None) -> Outcome:
     """What the plan after the run and the events of its stages say."""
     costs = costs_of(case, pipeline)
@@ -86,7 +86,7 @@ def outcome_of(case: Case, pipeline: Pipeline, plans: Mapping[str, StagePlan], t
                    log=str(engine_log) if engine_log and engine_log.is_file() else "", **facts)
 
 
-def costs_of(case: Case, pipeline: Pipeline) -> dict[str, object]:
+def costs_of(case: SubjectCase, pipeline: Pipeline) -> dict[str, object]:
     """Minutes in all, highest memory, bytes and warnings of the published stages."""
     costs = [read_cost(part.run.published(name)) for part, name in case.jobs(pipeline)]
     return {"minutes": round(sum(cost.wall_s or 0.0 for cost in costs) / 60, 2),
@@ -107,4 +107,4 @@ def write_summary(path: Path, outcomes: Sequence[Outcome], started: str, seconds
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise InputError("the summary cannot be written", where=str(path), got=error.strerror,
-                         mend="name another place with --summary FILE") from error
+                         hint="name another place with --summary FILE") from error

@@ -14,7 +14,7 @@ from shared.contract.folders import RunFolder
 from shared.contract.manifest import read_record
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
-from tools.cases import Case
+from tools.cases import SubjectCase
 from tools.gates import RECORD, read_flags
 from tools.outcome import Outcome, costs_of
 from tools.plan import CURRENT, StagePlan
@@ -25,7 +25,7 @@ TEMPLATE = Path(__file__).with_name("overview_page.html")
 FINISHED = ("review", "done")
 
 
-def outcome_now(case: Case, pipeline: Pipeline, plans: Mapping[str, StagePlan]) -> Outcome:
+def outcome_now(case: SubjectCase, pipeline: Pipeline, plans: Mapping[str, StagePlan]) -> Outcome:
     """How the subject stands, from its plan and its records; nothing is run, judged or written."""
     facts = {"subject": case.name, "folder": str(case.subject.folder), "results": str(case.run.root),
              **costs_of(case, pipeline)}
@@ -55,7 +55,7 @@ def write_overview(path: Path, outcomes: Sequence[Outcome], pipeline: Pipeline) 
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise InputError("the overview cannot be written", where=str(path), got=error.strerror,
-                         mend="choose another place") from error
+                         hint="choose another place") from error
 
 
 def page_beside(summary: Path) -> Path:

@@ -32,7 +32,7 @@ from shared.io.meshes import write_obj
 from shared.solve.capture import spread_frames
 from shared.solve.inverse_problem import FACE_SKIN, segment_vertices
 from shared.solve.reference_clip import START_FRAMES, Start, average_texture, make_start
-from shared.solve.views import Camera
+from shared.solve.views import ViewCamera
 from tools import peer_mitsuba
 
 VARIANT = "llvm_ad_rgb"
@@ -60,7 +60,7 @@ class PeerSolver:
         self.turns = world_from_head(inputs.camera_from_head, inputs.moves)
         self.mi = peer_mitsuba.mitsuba()
         light = np.broadcast_to(np.asarray(start.radiance, np.float32), (LIGHT_HEIGHT, 2 * LIGHT_HEIGHT, 3))
-        camera = Camera(inputs.camera_from_head[0], lens, self.size)
+        camera = ViewCamera(inputs.camera_from_head[0], lens, self.size)
         integrator = {"type": "prb", "max_depth": depth, "rr_depth": 1000, "hide_emitters": True}
         self.scene = peer_mitsuba.load_scene(inputs.mesh, light, camera, self._bsdf(start), integrator, samples)
         self.params = self.mi.traverse(self.scene)

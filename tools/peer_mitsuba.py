@@ -20,7 +20,7 @@ import numpy as np
 
 from shared.geometry import invert_rigid
 from shared.mesh import Mesh, unique_pairs, vertex_normals
-from shared.solve.views import Camera
+from shared.solve.views import ViewCamera
 
 VARIABLE = "LIMN_MITSUBA_VARIANT"
 DIRECT, ONE_BOUNCE, ALL_BOUNCES = 2, 3, 12
@@ -48,7 +48,7 @@ def mitsuba():
 
 
 def path_trace(
-    mesh: Mesh, latlong: np.ndarray, camera: Camera, coat: Coat, depth: int, samples: int, seed: int = 0
+    mesh: Mesh, latlong: np.ndarray, camera: ViewCamera, coat: Coat, depth: int, samples: int, seed: int = 0
 ) -> np.ndarray:
     """Linear radiance [h, w, 3] of the mesh, 0 beside it; the mean of `samples` paths per pixel, box filter.
 
@@ -61,7 +61,7 @@ def path_trace(
     return np.array(mi.render(scene, seed=seed, spp=samples))[..., :3]
 
 
-def load_scene(mesh: Mesh, latlong: np.ndarray, camera: Camera, bsdf: dict, integrator: dict, samples: int):
+def load_scene(mesh: Mesh, latlong: np.ndarray, camera: ViewCamera, bsdf: dict, integrator: dict, samples: int):
     """Mitsuba's scene of one mesh, "shape", under one environment map, "light", seen by one "sensor"."""
     mi = mitsuba()
     with tempfile.TemporaryDirectory() as folder:
@@ -83,7 +83,7 @@ def head_from_camera(camera_from_head: np.ndarray) -> np.ndarray:
     return invert_rigid(camera_from_head) @ np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
-def _sensor(mi, camera: Camera, samples: int) -> dict:
+def _sensor(mi, camera: ViewCamera, samples: int) -> dict:
     width, height = camera.size
     film = {
         "type": "hdrfilm",

@@ -1,6 +1,6 @@
 """Spoilt copies of a subject with known truth: what a bad clip, a bad landmark network or a wrong lens would give.
 
-Each copy is a subject of its own, with the truth of the original. Pixels are spoilt in code values, as a camera or a
+Each copy is a subject of its own, with the truth of the original. Pixels are degraded in code values, as a camera or a
 codec would; landmarks go in as a file of another tracker.
 """
 
@@ -19,8 +19,8 @@ from shared.io.arrays import load_arrays, save_arrays
 from shared.io.images import write_png
 from shared.io.video import open_video
 
-Spoil = Callable[[np.ndarray, int, int], np.ndarray]
-"""Frame's code values [H, W, 3] uint8, its number and how many there are -> the spoilt frame."""
+Degradation = Callable[[np.ndarray, int, int], np.ndarray]
+"""Frame's code values [H, W, 3] uint8, its number and how many there are -> the degraded frame."""
 
 
 def flicker(codes: np.ndarray, index: int, count: int) -> np.ndarray:
@@ -44,10 +44,10 @@ def _scaled(codes: np.ndarray, gain: float | np.ndarray) -> np.ndarray:
     return np.clip(codes * np.power(gain, 1 / 2.2) + 0.5, 0, 255).astype(np.uint8)
 
 
-PIXELS: dict[str, Spoil] = {"flicker": flicker, "motion_blur": motion_blur, "rolling_exposure": rolling_exposure}
+PIXELS: dict[str, Degradation] = {"flicker": flicker, "motion_blur": motion_blur, "rolling_exposure": rolling_exposure}
 
 
-def unspoilt(codes: np.ndarray, index: int, count: int) -> np.ndarray:
+def unchanged(codes: np.ndarray, index: int, count: int) -> np.ndarray:
     """The frame as it is, for copies that differ in the order of their frames only."""
     return codes
 
@@ -75,36 +75,36 @@ def landmark_gaps(points: np.ndarray, yaw: np.ndarray, rng: np.random.Generator)
 LANDMARKS = {"landmark_bias": landmark_bias, "landmark_outliers": landmark_outliers, "landmark_gaps": landmark_gaps}
 
 
-def spoil_pixels(subject: Path, destination: Path, spoil: Spoil, order: slice = slice(None)) -> None:
-    """A copy with spoilt frames, or with some frames only (order), as an image sequence with its own truth."""
+def degrade_pixels(subject: Path, destination: Path, degrade: Degradation, order: slice = slice(None)) -> None:
+    """A copy with degraded frames, or with some frames only (order), as an image sequence with its own truth."""
     source = load_subject(subject)
     frames = [frame.codes() for frame in open_video(source.video).frames()]
     chosen = range(len(frames))[order]
     (destination / "frames").mkdir(parents=True)
     for number, index in enumerate(chosen):
         codes = frames[index] if frames[index].dtype == np.uint8 else (frames[index] >> 8).astype(np.uint8)
-        write_png(destination / "frames" / f"{number:04d}.png", spoil(codes, number, len(chosen)))
+        write_png(destination / "frames" / f"{number:04d}.png", degrade(codes, number, len(chosen)))
     _describe(subject, destination, {"video": "frames/%04d.png"}, np.array(chosen))
 
 
-def spoil_landmarks(subject: Path, tracked: Path, destination: Path, spoil, seed: int = 0) -> None:
-    """A copy that brings spoilt landmarks; tracked: folder of track_landmarks with the subject's own."""
+def degrade_landmarks(subject: Path, tracked: Path, destination: Path, degrade, seed: int = 0) -> None:
+    """A copy that brings degraded landmarks; tracked: folder of track_landmarks with the subject's own."""
     from shared.io.frames import FrameSet
 
     landmarks = load_arrays(tracked / "landmarks.npz")
     frames = FrameSet.open(tracked.parent / "sample_frames")
     points = landmarks["landmarks_px"] / frames.crop[2] + frames.crop[:2]
     poses = load_arrays(tracked / "poses.npz")["camera_from_head"]
-    spoilt = spoil(points, np.arctan2(poses[:, 2, 0], poses[:, 0, 0]), np.random.default_rng(seed))
-    kept = np.isfinite(spoilt).all((1, 2))
+    degraded = degrade(points, np.arctan2(poses[:, 2, 0], poses[:, 0, 0]), np.random.default_rng(seed))
+    kept = np.isfinite(degraded).all((1, 2))
     destination.mkdir(parents=True)
     save_arrays(
-        destination / "landmarks.npz", landmarks_px=spoilt[kept], frame_index=landmarks["frame_index"][kept]
+        destination / "landmarks.npz", landmarks_px=degraded[kept], frame_index=landmarks["frame_index"][kept]
     )
     _describe(subject, destination, {"tracking": {"landmarks": "landmarks.npz"}}, None)
 
 
-def spoil_focal(subject: Path, destination: Path, gain: float) -> None:
+def degrade_focal(subject: Path, destination: Path, gain: float) -> None:
     """A copy that states a wrong focal length."""
     destination.mkdir(parents=True)
     camera = yaml.safe_load((subject / "subject.yaml").read_text(encoding="utf-8"))["camera"]

@@ -10,7 +10,7 @@ from shared.contract.drift import drift
 from shared.contract.hashing import HashMemory
 from shared.contract.manifest import damage, make_work, outputs_digest, own_inputs, read_manifest
 from shared.contract.pipeline import Pipeline
-from tools.cases import Case
+from tools.cases import SubjectCase
 
 CURRENT, RUNS, WAITS = "current", "will run", "may run"
 
@@ -24,10 +24,10 @@ class StagePlan:
     state: str
     reasons: tuple[str, ...] = ()
     digest: str | None = field(default=None, repr=False)
-    case: Case | None = field(default=None, repr=False)
+    case: SubjectCase | None = field(default=None, repr=False)
 
 
-def plan_case(pipeline: Pipeline, case: Case, parameters: Mapping[str, Mapping[str, object]],
+def plan_case(pipeline: Pipeline, case: SubjectCase, parameters: Mapping[str, Mapping[str, object]],
               verify: bool = False, renew: bool = False) -> dict[str, StagePlan]:
     """{label of the stage: plan} in the pipeline's order. verify: read every published file again. renew: a stage runs,
     too, where other code or packages made its result."""
@@ -42,7 +42,7 @@ def plan_case(pipeline: Pipeline, case: Case, parameters: Mapping[str, Mapping[s
     return plans
 
 
-def _plan_stage(stage: Stage, case: Case, parameters: Mapping[str, object], plans: Mapping[str, StagePlan],
+def _plan_stage(stage: Stage, case: SubjectCase, parameters: Mapping[str, object], plans: Mapping[str, StagePlan],
                 memory: HashMemory) -> StagePlan:
     folder = case.run.published(stage.name)
     manifest = read_manifest(folder)
@@ -74,7 +74,7 @@ def kept_lines(plans: Mapping[str, StagePlan]) -> list[str]:
     return [f"{label}: {reason}" for label, plan in plans.items() if plan.state == CURRENT for reason in plan.reasons]
 
 
-def plan_lines(case: Case, plans: Mapping[str, StagePlan]) -> list[str]:
+def plan_lines(case: SubjectCase, plans: Mapping[str, StagePlan]) -> list[str]:
     """The plan for people."""
     width = max(map(len, plans))
     lines = [f"{case.name}: {case.run.root}"]

@@ -13,7 +13,7 @@ _LARGEST = 1e15
 
 
 @dataclass(frozen=True)
-class Cost:
+class RecordedCost:
     """What a published stage took, as its provenance.json says; None where it does not say."""
 
     wall_s: float | None = None
@@ -23,13 +23,13 @@ class Cost:
     warnings: tuple[str, ...] = ()
 
 
-def read_cost(folder: Path) -> Cost:
+def read_cost(folder: Path) -> RecordedCost:
     """The cost of the stage that is published in the folder."""
     record = read_record(folder / PROVENANCE) or {}
     started, warnings = record.get("started"), record.get("warnings")
-    return Cost(*(amount_of(record, name) for name in ("wall_s", "peak_memory_mb", "bytes")),
-                started if is_line(started) else None,
-                tuple(filter(is_line, warnings)) if isinstance(warnings, list) else ())
+    return RecordedCost(*(amount_of(record, name) for name in ("wall_s", "peak_memory_mb", "bytes")),
+                        started if is_line(started) else None,
+                        tuple(filter(is_line, warnings)) if isinstance(warnings, list) else ())
 
 
 def amount_of(record: object, name: str) -> float | None:

@@ -32,7 +32,7 @@ from shared.io.images import write_exr, write_png
 from shared.raycast import pixel_directions
 from shared.shading import DEEP
 from shared.solve.capture import Sizes
-from shared.solve.views import Camera, HeadViews, orbit_camera
+from shared.solve.views import HeadViews, ViewCamera, orbit_camera
 from shared.view_set import ROUGHNESSES
 from tools.relight_inputs import Asset, open_asset, read_light, turned_head, turned_light
 from tools.relight_options import CLAY, check_options, parser
@@ -42,16 +42,16 @@ AT_ONCE = 16
 
 
 @dataclass(frozen=True)
-class Shot:
+class RelightShot:
     """One picture: its file's stem, camera, how far the light is turned, and what moves against the light."""
 
     stem: str
-    camera: Camera
+    camera: ViewCamera
     light_yaw_deg: float
     moves: str
 
 
-def plan_shots(asset: Asset, options: argparse.Namespace) -> list[Shot]:
+def plan_shots(asset: Asset, options: argparse.Namespace) -> list[RelightShot]:
     """What is to be seen, in order. InputError where the clip has no such frame."""
     if options.frames:
         return [_clip_shot(asset, frame, options) for frame in options.frames]
@@ -59,21 +59,21 @@ def plan_shots(asset: Asset, options: argparse.Namespace) -> list[Shot]:
     return [_turned_shot(asset, i, *turn, options) for i, turn in enumerate(turns or options.view or [(0.0, 0.0)])]
 
 
-def _turned_shot(asset: Asset, i: int, yaw: float, pitch: float, options: argparse.Namespace) -> Shot:
+def _turned_shot(asset: Asset, i: int, yaw: float, pitch: float, options: argparse.Namespace) -> RelightShot:
     stem = f"{i:04d}" if options.turntable else f"yaw{yaw:+.0f}_pitch{pitch:+.0f}"
     front = orbit_camera(asset.mesh, 0.0, 0.0, options.size)
     if options.turn == "camera":
-        return Shot(stem, orbit_camera(asset.mesh, yaw, pitch, options.size), options.light_yaw, "camera")
+        return RelightShot(stem, orbit_camera(asset.mesh, yaw, pitch, options.size), options.light_yaw, "camera")
     if options.turn == "light":
-        return Shot(stem, front, options.light_yaw + yaw, "head")
+        return RelightShot(stem, front, options.light_yaw + yaw, "head")
     pose = turned_head(asset.mesh, front.camera_from_head, yaw, pitch)
-    return Shot(stem, Camera(pose, front.intrinsics, front.size), options.light_yaw, "head")
+    return RelightShot(stem, ViewCamera(pose, front.intrinsics, front.size), options.light_yaw, "head")
 
 
-def _clip_shot(asset: Asset, frame: int, options: argparse.Namespace) -> Shot:
+def _clip_shot(asset: Asset, frame: int, options: argparse.Namespace) -> RelightShot:
     """A frame of the clip through its own lens, whose axis is taken for the picture's middle."""
     if asset.poses is None:
-        raise InputError("a mesh has no frames", where="--frames", mend="use --view or --turntable")
+        raise InputError("a mesh has no frames", where="--frames", hint="use --view or --turntable")
     found = np.nonzero(asset.frame_index == frame)[0]
     if len(found) == 0:
         low, high = int(asset.frame_index.min()), int(asset.frame_index.max())
@@ -83,13 +83,14 @@ def _clip_shot(asset: Asset, frame: int, options: argparse.Namespace) -> Shot:
     scale = options.size / (2.0 * asset.intrinsics[1, 2])
     width = 2 * round(asset.intrinsics[0, 2] * scale)
     lens = np.diag([scale, scale, 1.0]) @ asset.intrinsics
-    return Shot(
-        f"frame{frame:06d}", Camera(asset.poses[found[0]], lens, (width, options.size)), options.light_yaw, asset.moves
+    return RelightShot(
+        f"frame{frame:06d}", ViewCamera(asset.poses[found[0]], lens, (width, options.size)), options.light_yaw,
+        asset.moves
     )
 
 
 def render_shots(
-    views: HeadViews, shots: list[Shot], light: np.ndarray, background: np.ndarray | str
+    views: HeadViews, shots: list[RelightShot], light: np.ndarray, background: np.ndarray | str
 ) -> Iterator[np.ndarray]:
     """Linear pictures [h, w, 3] in order. background: a colour [3], or "environment"."""
     for start in range(0, len(shots), AT_ONCE):
@@ -103,7 +104,7 @@ def render_shots(
                 yield picture + _behind(views, shot, seen, background)
 
 
-def _behind(views: HeadViews, shot: Shot, light: np.ndarray, background: np.ndarray | str) -> np.ndarray:
+def _behind(views: HeadViews, shot: RelightShot, light: np.ndarray, background: np.ndarray | str) -> np.ndarray:
     """What shows beside the head: [h, w, 3], 0 where the head covers the pixel."""
     camera = shot.camera
     colour = background
@@ -115,7 +116,7 @@ def _behind(views: HeadViews, shot: Shot, light: np.ndarray, background: np.ndar
 
 
 def save_pictures(
-    out: Path, name: str, shots: list[Shot], pictures: Iterator[np.ndarray], options: argparse.Namespace
+    out: Path, name: str, shots: list[RelightShot], pictures: Iterator[np.ndarray], options: argparse.Namespace
 ) -> list[Path]:
     """Stills or a video of one light -> the files."""
     exposed = (picture * 2.0**options.exposure for picture in pictures)
@@ -138,7 +139,7 @@ def _coded(picture: np.ndarray) -> np.ndarray:
     return np.round(encode_srgb(np.clip(picture, 0.0, 1.0)) * 255.0).astype(np.uint8)
 
 
-def save_visibility(out: Path, views: HeadViews, camera: Camera, roughnesses: list[float]) -> list[Path]:
+def save_visibility(out: Path, views: HeadViews, camera: ViewCamera, roughnesses: list[float]) -> list[Path]:
     """V~ as grey pictures, mid blue beside the mesh."""
     written = []
     for roughness in roughnesses:
@@ -156,7 +157,7 @@ def run(options: argparse.Namespace) -> list[Path]:
     given = {name: getattr(options, name) for name in CLAY if getattr(options, name) is not None}
     if given and options.asset.is_dir():
         raise InputError(
-            "a result has maps of its own", where=f"--{next(iter(given))}", mend="leave it out, or name a mesh"
+            "a result has maps of its own", where=f"--{next(iter(given))}", hint="leave it out, or name a mesh"
         )
     asset = open_asset(options.asset, **{**CLAY, **given})
     lights = {Path(name).stem: read_light(name, asset) for name in options.light}

@@ -65,7 +65,7 @@ def _open_result(path: Path) -> Asset:
             "no result in this folder",
             where=str(path),
             expected="maps/ and poses.npz",
-            mend="name an export/ folder, or run limn first",
+            hint="name an export/ folder, or run limn first",
         )
     mesh = load_mesh(folder / "mesh.npz") if (folder / "mesh.npz").is_file() else read_obj(folder / "mesh.obj")
     arrays = load_arrays(folder / "poses.npz")
@@ -96,7 +96,7 @@ def _moves(folder: Path) -> str:
         if (folder / name).is_file():
             model = read_json(folder / name).get("model", {})
             return "camera" if isinstance(model, dict) and model.get("moves") == "camera" else "head"
-    raise InputError("neither run.json nor solve.json", where=str(folder), mend="name a complete result")
+    raise InputError("neither run.json nor solve.json", where=str(folder), hint="name a complete result")
 
 
 def _read_mesh(path: Path) -> Mesh:
@@ -108,7 +108,7 @@ def _read_mesh(path: Path) -> Mesh:
     try:
         import trimesh
     except ImportError as error:
-        raise InputError("this kind of mesh needs trimesh", where=str(path), mend="pip install trimesh") from error
+        raise InputError("this kind of mesh needs trimesh", where=str(path), hint="pip install trimesh") from error
     try:
         found = trimesh.load(path, force="mesh")
         found.merge_vertices(merge_tex=True, merge_norm=True)

@@ -42,7 +42,7 @@ class _Parser(argparse.ArgumentParser):
     """Faults of the command line as one line."""
 
     def error(self, message: str):
-        raise InputError(message, where="tools.relight", mend="see --help")
+        raise InputError(message, where="tools.relight", hint="see --help")
 
 
 def parser(description: str) -> argparse.ArgumentParser:
@@ -125,4 +125,4 @@ def check_options(options: argparse.Namespace) -> None:
             "not the name of a video", where="--video", got=options.video, expected="NAME.mp4, put into --out"
         )
     if options.video and options.size % 2:
-        raise InputError("videos have even sizes", where="--size", got=options.size, mend="add one")
+        raise InputError("videos have even sizes", where="--size", got=options.size, hint="add one")

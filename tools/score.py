@@ -33,7 +33,7 @@ from shared.io.images import read_exr, read_png
 from shared.io.meshes import read_obj
 from shared.mesh import Mesh
 from tools import score_align, score_measures
-from tools.score_buffers import SurfaceViewer
+from tools.score_buffers import BufferRenderer
 from tools.score_table import table
 
 SCORED_FRAMES = 12
@@ -41,7 +41,7 @@ MAPS = {"albedo": "diffuse_albedo", "specular": "specular_intensity", "roughness
 
 
 @dataclass(frozen=True)
-class Result:
+class ScoredResult:
     """A result: its mesh, its textures by the truth's names, and a pose for each frame_index."""
 
     folder: Path
@@ -51,7 +51,7 @@ class Result:
     intrinsics: np.ndarray
 
 
-def load_result(folder: Path, intrinsics: np.ndarray) -> Result:
+def load_result(folder: Path, intrinsics: np.ndarray) -> ScoredResult:
     """Reads an export/ folder; intrinsics [3,3] serve when poses.npz has none."""
     arrays = load_arrays(folder / "poses.npz")
     if "camera_from_head" not in arrays:
@@ -60,7 +60,7 @@ def load_result(folder: Path, intrinsics: np.ndarray) -> Result:
     poses = dict(zip(frame_index.tolist(), arrays["camera_from_head"].astype(np.float64), strict=True))
     paths = {name: folder / "maps" / f"{file}.exr" for name, file in MAPS.items()}
     textures = {name: read_exr(path) for name, path in paths.items() if path.exists()}
-    return Result(folder, read_obj(folder / "mesh.obj"), textures, poses, arrays.get("intrinsics", intrinsics))
+    return ScoredResult(folder, read_obj(folder / "mesh.obj"), textures, poses, arrays.get("intrinsics", intrinsics))
 
 
 def score(
@@ -76,7 +76,7 @@ def score(
     """
     subject, export = Path(subject), Path(export)
     if not (subject / "gt").is_dir():
-        raise InputError("no ground truth", where=str(subject), expected="a gt/ folder", mend="see tools/synthesize.py")
+        raise InputError("no ground truth", where=str(subject), expected="a gt/ folder", hint="see tools/synthesize.py")
     truth = load_arrays(subject / "gt" / "poses.npz")
     result = load_result(export, camera_intrinsics(subject))
     common = [i for i in sorted(result.poses) if i < len(truth["camera_from_head"])]
@@ -96,7 +96,7 @@ def score(
     return {"subject": subject.resolve().name, "result": str(export), **scores}
 
 
-def scored_frames(gt_frames: np.ndarray, result: Result, count: int = SCORED_FRAMES) -> list[int]:
+def scored_frames(gt_frames: np.ndarray, result: ScoredResult, count: int = SCORED_FRAMES) -> list[int]:
     """At most count of the frames whose truth is known and that have a pose in the result, spread evenly."""
     known = [int(i) for i in gt_frames if int(i) in result.poses]
     chosen = np.unique(np.linspace(0, len(known) - 1, min(count, len(known))).astype(int))
@@ -128,10 +128,10 @@ def score_geometry(
 
 
 def score_appearance(
-    subject: Path, result: Result, frames: list[int], truth_from_result: np.ndarray, rng: np.random.Generator
+    subject: Path, result: ScoredResult, frames: list[int], truth_from_result: np.ndarray, rng: np.random.Generator
 ) -> dict:
     """Normals, coverage, textures and re-renders on the face skin of the given frames."""
-    viewer = SurfaceViewer(result.mesh, result.textures)
+    viewer = BufferRenderer(result.mesh, result.textures)
     angles, coverage, rendered = [], [], []
     pairs: dict[str, list] = {name: [] for name in result.textures}
     for frame in frames:

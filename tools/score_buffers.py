@@ -12,7 +12,7 @@ from shared.raycast import RayScene
 from shared.texture import sample_bilinear
 
 
-class SurfaceViewer:
+class BufferRenderer:
     """Ray-traces one mesh with any number of UV textures (name -> [H,W] or [H,W,3])."""
 
     def __init__(self, mesh: Mesh, textures: dict[str, np.ndarray]):

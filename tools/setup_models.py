@@ -108,7 +108,7 @@ def set_up(folder: Path) -> None:
             "the models folder cannot be made",
             where=str(folder),
             got=error.strerror,
-            mend="set LIMN_MODELS to a folder that can be written",
+            hint="set LIMN_MODELS to a folder that can be written",
         ) from error
     with tempfile.TemporaryDirectory(dir=folder, prefix=".setup-") as scratch_name:
         scratch = Path(scratch_name)
@@ -179,7 +179,7 @@ def fetch(wheel: Wheel, folder: Path) -> Path:
             "a wheel could not be fetched",
             where=wheel.requirement,
             got=lines[-1],
-            mend="check the connection to the package index and run make setup again",
+            hint="check the connection to the package index and run make setup again",
         )
     require_hash(path, wheel.sha256)
     return path
@@ -194,7 +194,7 @@ def require_hash(path: Path, sha256: str) -> None:
             where=path.name,
             got=f"SHA-256 {got[:16]}",
             expected=sha256[:16],
-            mend="check the package index in use",
+            hint="check the package index in use",
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 
-from tools.cases import Case
+from tools.cases import SubjectCase
 from tools.engine import EVENTS, SCRATCH
 from tools.gates import read_flags
 from tools.housekeeping import folder_size, readable_size
@@ -16,7 +16,7 @@ from tools.watch import Track
 HEADER = f"{'state':9} {'size':>10} {'seconds':>8} {'peak':>9}  {'started':25}  folder"
 
 
-def status_of(case: Case, plans: Mapping[str, StagePlan]) -> dict[str, object]:
+def status_of(case: SubjectCase, plans: Mapping[str, StagePlan]) -> dict[str, object]:
     """One subject as a record: its stages with state, cost, size and, of those that run now, progress."""
     live = {track.stage: track for track in running_stages(case)}
     stages = []
@@ -39,7 +39,7 @@ def status_of(case: Case, plans: Mapping[str, StagePlan]) -> dict[str, object]:
             "running": case.run.is_locked("run"), "flags": flags if current else [], "stages": stages}
 
 
-def running_stages(case: Case) -> Iterator[Track]:
+def running_stages(case: SubjectCase) -> Iterator[Track]:
     """The stages at work, as their events tell; none where no living process holds the subject."""
     if not case.run.is_locked("run"):
         return

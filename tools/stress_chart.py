@@ -1,4 +1,4 @@
-"""The stress test as one picture: a panel a dial, every score over severity, and below what Limn said."""
+"""The stress test as one picture: a panel a perturbation, every score over severity, and below what Limn said."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _STYLE = (
 
 
 def write_chart(rows: Sequence[dict], path: Path) -> None:
-    """rows: of stress.verdicts, in order, dial by dial."""
+    """rows: of stress.verdicts, in order, perturbation by perturbation."""
     panels = [_panel(list(own)) for _, own in groupby(rows, key=lambda row: row["dial"].name)]
     lines = -(-len(panels) // _COLUMNS)
     width, height = _COLUMNS * _WIDTH, lines * _HEIGHT + 60
@@ -33,15 +33,15 @@ def write_chart(rows: Sequence[dict], path: Path) -> None:
     legend = f'<g transform="translate(0 {lines * _HEIGHT + 8})">{_legend()}</g>'
     path.write_text(
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img" aria-label="scores over '
-        f'the severity of each dial"><style>{_STYLE}</style><rect width="100%" height="100%" fill="#fff"/>'
+        f'the severity of each perturbation"><style>{_STYLE}</style><rect width="100%" height="100%" fill="#fff"/>'
         f'{"".join(placed)}{legend}</svg>\n', encoding="utf-8")
 
 
 def _panel(rows: list[dict]) -> str:
-    """One dial: the axes, a curve a score, a square a severity in the colour of its verdict."""
-    dial, count = rows[0]["dial"], len(rows)
+    """One perturbation: the axes, a curve a score, a square a severity in the colour of its verdict."""
+    perturbation, count = rows[0]["dial"], len(rows)
     across = _LEFT + 8 + np.arange(count) * (_PLOT[0] - 16) / max(count - 1, 1)
-    parts = [f'<text class="name" x="{_LEFT}" y="14">{escape(dial.name.replace("_", " "))}</text>']
+    parts = [f'<text class="name" x="{_LEFT}" y="14">{escape(perturbation.name.replace("_", " "))}</text>']
     for power in range(int(_LOWEST), int(_HIGHEST) + 1):
         kind = "limit" if power == 0 else "grid"
         parts.append(f'<path class="{kind}" d="M{_LEFT} {_down(2.0**power):.1f}h{_PLOT[0]}"/>')
@@ -61,7 +61,8 @@ def _panel(rows: list[dict]) -> str:
         parts.append(f'<rect x="{x - 5:.1f}" y="{bottom + 5}" width="10" height="10" '
                      f'fill="{VERDICT_COLOURS[verdict.word]}"><title>{text}</title></rect>')
         parts.append(f'<text x="{x:.1f}" y="{bottom + 27}" text-anchor="middle">{row["severity"]:g}</text>')
-    parts.append(f'<text x="{_LEFT + _PLOT[0] / 2}" y="{bottom + 40}" text-anchor="middle">{escape(dial.unit)}</text>')
+    parts.append(f'<text x="{_LEFT + _PLOT[0] / 2}" y="{bottom + 40}" text-anchor="middle">'
+                 f"{escape(perturbation.unit)}</text>")
     return "".join(parts)
 
 

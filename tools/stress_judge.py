@@ -1,10 +1,10 @@
 """The verdict on a stress case: right, degraded and said so, or wrong and silent.
 
 Wrong: a score is worse than its limit (relative to the truth) and also worse than its growth times the score of the
-same dial at 0. Said, by any of
+same perturbation at 0. Said, by any of
 - refusal: a stage ends with exit code 2;
-- gate: a quality gate of pipeline.yaml is missed that the dial at 0 keeps;
-- warning: one that the dial at 0 does not give and that mentions what the dial is about (its `says`);
+- gate: a quality gate of pipeline.yaml is missed that the perturbation at 0 keeps;
+- warning: one that the perturbation at 0 does not give and that mentions what the perturbation is about (its `says`);
 - confidence: all that is wrong is the albedo, and where the confidence is above 0.5 it is right.
 Whatever is wrong and not said is wrong and silent; a stage that ends with exit code 1 has failed.
 """
@@ -49,7 +49,7 @@ class Verdict:
 
 
 def is_wrong(name: str, value: float, at_zero: float) -> bool:
-    """Whether a score's value (NaN too) is worse than its limit and than what the dial at 0 allows."""
+    """Whether a score's value (NaN too) is worse than its limit and than what the perturbation at 0 allows."""
     return not value <= allowed(name, at_zero)
 
 

@@ -13,22 +13,22 @@ from shared.io.arrays import load_arrays, save_arrays
 from shared.io.images import read_exr, write_png
 from tools import synth_output
 from tools.stress_camera import image_motion, photograph, shaken
-from tools.stress_dials import Case
-from tools.stress_takes import SETTINGS, camera, render_take
+from tools.stress_dials import StressCase
+from tools.stress_takes import SETTINGS, camera, render_scene
 from tools.synth_head import smooth_random
 from tools.synthesize import FPS, SENSOR_MM
 
 VIDEO = "frames/%04d.png"
 
 
-def make_subject(case: Case, folder: Path, takes: Path) -> Path:
-    """Writes the case's subject into folder, unless it is there; takes: where rendered takes are kept."""
+def make_subject(case: StressCase, folder: Path, scenes: Path) -> Path:
+    """Writes the case's subject into folder, unless it is there; scenes: where rendered scenes are kept."""
     if (folder / "subject.yaml").exists():
         return folder
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "frames").mkdir(parents=True)
     (folder / "gt" / "frames").mkdir(parents=True)
-    parts = [(render_take(take, takes), gain) for take, gain in case.mix if gain]
+    parts = [(render_scene(scene, scenes), gain) for scene, gain in case.mix if gain]
     first = parts[0][0]
     truth = load_arrays(first / "gt" / "poses.npz")
     poses, points = truth["camera_from_head"], load_arrays(first / "landmarks.npz")["points_head"]
@@ -63,7 +63,7 @@ def _kept(truth: np.ndarray, count: int, keep: int) -> np.ndarray:
 
 
 def _write_truth(folder: Path, parts: list[tuple[Path, float]], kept: np.ndarray, poses: np.ndarray) -> None:
-    """gt/: the first take's, of the frames that are left, with all frames' poses, and the light that stands still."""
+    """gt/: the first scene's, of the frames that are left, with all frames' poses, and the light that stands still."""
     source = parts[0][0] / "gt"
     truth = load_arrays(source / "poses.npz")
     for file in source.iterdir():
@@ -81,7 +81,7 @@ def _write_truth(folder: Path, parts: list[tuple[Path, float]], kept: np.ndarray
     synth_output.write_environment(folder / "envmap.exr", light)
 
 
-def _given_tracking(case: Case, folder: Path, poses: np.ndarray, points: np.ndarray) -> dict:
+def _given_tracking(case: StressCase, folder: Path, poses: np.ndarray, points: np.ndarray) -> dict:
     """Poses or landmarks of "another tracker" with their errors -> `tracking` of subject.yaml."""
     index = np.arange(len(poses))
     if case.pose_error_deg:

@@ -42,8 +42,8 @@ def _page(rows: Sequence[dict], missing: Sequence[str], code: str) -> list[str]:
     zero = rows[0]["scores"]
     lines = [
         "# Where Limn fails, and whether it says so", "",
-        "Made by `python -m tools.stress`: synthetic subjects whose truth is known, one severity dial each, run with "
-        "small settings (224 px, 24 frames, maps of 256 texels, the mesh as tracked). The dial at 0 is the same for "
+        "Made by `python -m tools.stress`: synthetic subjects whose truth is known, one perturbation each, run with "
+        "small settings (224 px, 24 frames, maps of 256 texels, the mesh as tracked). Severity 0 is the same case for "
         "all.", "",
         "![Scores over severity](stress.svg)", "",
         "**Wrong**: a score is worse than its limit and than its growth times the score at 0. **Said**: a stage "
@@ -53,7 +53,8 @@ def _page(rows: Sequence[dict], missing: Sequence[str], code: str) -> list[str]:
         *(f"| {name} | {limit.what} | {limit.most:g} {limit.unit} | {limit.growth:g} | {zero[name]:.3g} |"
           for name, limit in LIMITS.items()), "",
         f"{sum(row['severity'] > 0 for row in rows)} cases, wrong and silent or failed: {len(bad)}. Bold scores are "
-        f"wrong. Gates that the dial at 0 misses, which do not count: {'; '.join(rows[0]['missed_gates']) or 'none'}.",
+        "wrong. Gates that the case at 0 misses, which do not count: "
+        f"{'; '.join(rows[0]['missed_gates']) or 'none'}.",
         "",
         "| dial | severity | " + " | ".join(LIMITS) + " | verdict | what Limn said |",
         "|---|---|" + "---|" * len(LIMITS) + "---|---|",
@@ -67,12 +68,12 @@ def _page(rows: Sequence[dict], missing: Sequence[str], code: str) -> list[str]:
 
 
 def _line(row: dict, zero: dict, old: bool) -> str:
-    verdict, scores, dial = row["verdict"], row["scores"], row["dial"]
+    verdict, scores, perturbation = row["verdict"], row["scores"], row["dial"]
     cells = []
     for name in LIMITS:
         value = scores.get(name)
         text = "" if value is None else f"{value:.3g}"
         cells.append(f"**{text}**" if text and is_wrong(name, value, zero[name]) else text)
     said, mark = "; ".join(verdict.said) or "nothing", " \\*" if old else ""
-    return (f"| {dial.what}{mark} | {row['severity']:g} {dial.unit} | " + " | ".join(cells)
+    return (f"| {perturbation.what}{mark} | {row['severity']:g} {perturbation.unit} | " + " | ".join(cells)
             + f" | {verdict.word} | {said.replace('|', '/')} |")

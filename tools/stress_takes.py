@@ -1,7 +1,7 @@
 """What stands before the camera in a stress test: a synthetic head under some light, as linear pictures with truth.
 
-A take is rendered once and kept; what a camera makes of it is another matter (stress_camera), and takes under different
-lights may be added up, because light is additive.
+A scene is rendered once and kept; what a camera makes of it is another matter (stress_camera), and scenes under
+different lights may be added up, because light is additive.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from shared.envmap import latlong_directions
 from shared.io.arrays import save_arrays
 from tools import synth_output
-from tools.synth_camera import Camera, PictureQuality
+from tools.synth_camera import PictureQuality, PinholeCamera
 from tools.synth_head import Head, random_head
 from tools.synth_irradiance import IrradianceQuality
 from tools.synth_makeup import made_up, sweaty
@@ -25,14 +25,15 @@ from tools.synth_render import RenderQuality, Scene, render
 from tools.synth_skin import Complexion, SkinPainter
 from tools.synth_surface import Materials
 from tools.synth_wear import coloured, with_beard, with_fringe, with_glasses
-from tools.synthesize import SENSOR_MM, Settings, head_model, light_of, plan_shots
+from tools.synthesize import SENSOR_MM, SynthesisSettings, head_model, light_of, plan_shots
 
-SETTINGS = Settings(size=224, frames=24, level=1, texture=512, truth_frames=6, lights=("room",), light_height=32,
-                    irradiance=IrradianceQuality(size=128, directions=512, lamp_samples=16),
-                    picture=PictureQuality(sub=2, lobe_samples=1, lamp_samples=2))
+SETTINGS = SynthesisSettings(size=224, frames=24, level=1, texture=512, truth_frames=6, lights=("room",),
+                             light_height=32,
+                             irradiance=IrradianceQuality(size=128, directions=512, lamp_samples=16),
+                             picture=PictureQuality(sub=2, lobe_samples=1, lamp_samples=2))
 """Small, so that a run takes less than a minute on one core; the face is 115 px high."""
 RECIPE = 1
-"""Raise it whenever SETTINGS or the code that renders give other pictures: kept takes and rows are then not used."""
+"""Raise it whenever SETTINGS or the code that renders give other pictures: kept scenes and rows are then not used."""
 TINTS = np.array([[1.0, 0.12, 0.1], [0.1, 0.25, 1.0]])
 """Colours of the light from the left and from the right."""
 SMILE = {"mouth_smile_left": 1.0, "mouth_smile_right": 1.0, "jaw_open": 0.35, "cheek_puff": 0.2}
@@ -41,7 +42,7 @@ SMILE_TIMES = ((0.40, 0.5), (0.44, 1.0), (0.66, 0.5), (0.70, 0.0))
 
 
 @dataclass(frozen=True)
-class Take:
+class StressScene:
     """light: one of ENVIRONMENTS; on_head: it turns with the head; tint: how coloured the two sides are, 0 to 1.
 
     tone: melanin; makeup, wet, fringe: shares; glasses_mm, beard_mm: thickness; smile: what comes and goes mid-clip.
@@ -71,29 +72,29 @@ class Take:
         return "_".join([*changed, hashlib.sha256(content.encode()).hexdigest()[:8]])
 
     @property
-    def settings(self) -> Settings:
+    def settings(self) -> SynthesisSettings:
         """Of the synthesiser; sharp highlights need more samples."""
         quality = SETTINGS.picture if not self.wet else replace(SETTINGS.picture, lobe_samples=4, lamp_samples=8)
         return replace(SETTINGS, frames=self.frames, yaw_deg=self.yaw_deg, pitch_deg=self.pitch_deg, tone=self.tone,
                        lights=(self.light,), seed=self.seed, picture=quality)
 
 
-def camera() -> Camera:
-    """The one that looks at every take."""
-    return Camera(SETTINGS.size, SETTINGS.size, SETTINGS.focal_mm / SENSOR_MM * SETTINGS.size)
+def camera() -> PinholeCamera:
+    """The one that looks at every scene."""
+    return PinholeCamera(SETTINGS.size, SETTINGS.size, SETTINGS.focal_mm / SENSOR_MM * SETTINGS.size)
 
 
-def render_take(take: Take, folder: Path, processes: int = 1) -> Path:
-    """folder/<take's name> with radiance.npy [F, H, W, 3] half floats and gt/; rendered unless it is there."""
-    done = folder / take.name
+def render_scene(scene: StressScene, folder: Path, processes: int = 1) -> Path:
+    """folder/<scene's name> with radiance.npy [F, H, W, 3] half floats and gt/; rendered unless it is there."""
+    done = folder / scene.name
     if (done / "radiance.npy").exists():
         return done
-    settings, truth, states, light = take.settings, _truth_frames(take), list(_states(take)), _light(take)
+    settings, truth, states, light = scene.settings, _truth_frames(scene), list(_states(scene)), _light(scene)
     shots = plan_shots(states[0][0], settings)
-    if take.on_head:
+    if scene.on_head:
         shots = [replace(shot, world_from_head=np.eye(3)) for shot in shots]
     (done / "gt").mkdir(parents=True, exist_ok=True)
-    pictures: list[np.ndarray | None] = [None] * take.frames
+    pictures: list[np.ndarray | None] = [None] * scene.frames
     for number, (head, materials, index) in enumerate(states):
         scene = Scene(head.mesh, materials, (light,))
         if number == 0:
@@ -122,38 +123,38 @@ def smile_of(frames: int) -> np.ndarray:
     return amount
 
 
-def _truth_frames(take: Take) -> np.ndarray:
+def _truth_frames(scene: StressScene) -> np.ndarray:
     """Frames that get buffers, evenly spread over those with the face that the mesh has."""
-    still = np.arange(take.frames) if not take.smile else np.nonzero(smile_of(take.frames) == 0)[0]
+    still = np.arange(scene.frames) if not scene.smile else np.nonzero(smile_of(scene.frames) == 0)[0]
     return still[np.unique(np.linspace(0, len(still) - 1, SETTINGS.truth_frames).round().astype(int))]
 
 
-def _states(take: Take) -> Iterator[tuple[Head, Materials, list[int]]]:
+def _states(scene: StressScene) -> Iterator[tuple[Head, Materials, list[int]]]:
     """Heads with their textures and frames: the neutral one first."""
     model = head_model(SETTINGS.level)
-    amount = take.smile * smile_of(take.frames)
-    neutral = random_head(model, take.seed, False)
+    amount = scene.smile * smile_of(scene.frames)
+    neutral = random_head(model, scene.seed, False)
     # Painted once: what the skin shows moves along with it.
-    painter = SkinPainter(neutral, SETTINGS.texture, take.seed)
-    stubble = 1.3 if take.beard_mm else Complexion.stubble
-    materials = sweaty(made_up(painter.paint(Complexion(tone=take.tone, stubble=stubble)), painter, take.makeup),
-                       take.wet)
-    if take.glasses_mm or take.fringe:
+    painter = SkinPainter(neutral, SETTINGS.texture, scene.seed)
+    stubble = 1.3 if scene.beard_mm else Complexion.stubble
+    materials = sweaty(made_up(painter.paint(Complexion(tone=scene.tone, stubble=stubble)), painter, scene.makeup),
+                       scene.wet)
+    if scene.glasses_mm or scene.fringe:
         materials = coloured(materials)
     for value in sorted(set(amount)):
-        head = random_head(model, take.seed, False, {name: value * part for name, part in SMILE.items()})
-        if take.beard_mm:
-            head = with_beard(head, take.beard_mm, take.seed)
-        if take.glasses_mm:
-            head = with_glasses(head, take.glasses_mm)
-        if take.fringe:
-            head = with_fringe(head, take.fringe, take.seed)
+        head = random_head(model, scene.seed, False, {name: value * part for name, part in SMILE.items()})
+        if scene.beard_mm:
+            head = with_beard(head, scene.beard_mm, scene.seed)
+        if scene.glasses_mm:
+            head = with_glasses(head, scene.glasses_mm)
+        if scene.fringe:
+            head = with_fringe(head, scene.fringe, scene.seed)
         yield head, materials, np.nonzero(amount == value)[0].tolist()
 
 
-def _light(take: Take) -> np.ndarray:
-    """[H, 2 H, 3] the take's environment."""
-    image = light_of(take.light, take.settings)
+def _light(scene: StressScene) -> np.ndarray:
+    """[H, 2 H, 3] the scene's environment."""
+    image = light_of(scene.light, scene.settings)
     side = np.clip(0.5 + 1.5 * latlong_directions(len(image))[..., :1], 0.0, 1.0)
     tint = (1 - side) * TINTS[0] + side * TINTS[1]
-    return (image * (1.0 + take.tint * (tint - 1.0))).astype(np.float32)
+    return (image * (1.0 + scene.tint * (tint - 1.0))).astype(np.float32)

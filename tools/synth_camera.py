@@ -15,15 +15,15 @@ from shared.geometry import project
 from shared.mesh import normalised
 from shared.texture import sample_bilinear
 from tools.synth_gloss import SAMPLE_SETS, GlossSamples, glossy_radiance
-from tools.synth_irradiance import Shot
+from tools.synth_irradiance import SyntheticShot
 from tools.synth_light import EnvironmentLight
-from tools.synth_surface import Surface
+from tools.synth_surface import SyntheticSurface
 
 TEXTURES = ("albedo", "specular", "roughness")
 
 
 @dataclass(frozen=True)
-class Camera:
+class PinholeCamera:
     """Pinhole with its principal point in the middle: width and height in pixels, focal length in pixels."""
 
     width: int
@@ -45,7 +45,8 @@ class PictureQuality:
     lamp_samples: int = 4
 
 
-def take_picture(surface: Surface, light: EnvironmentLight, irradiance: np.ndarray, shot: Shot, camera: Camera,
+def take_picture(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray, shot: SyntheticShot,
+                 camera: PinholeCamera,
                  quality: PictureQuality) -> dict[str, np.ndarray]:
     """irradiance [size, size, 3] of this shot -> float32 images by name.
 
@@ -84,7 +85,7 @@ def _averaged(total: dict[str, np.ndarray], rays: int) -> dict[str, np.ndarray]:
     return {name: image.astype(np.float32) for name, image in total.items()}
 
 
-def _head_pixels(surface: Surface, shot: Shot, camera: Camera) -> np.ndarray:
+def _head_pixels(surface: SyntheticSurface, shot: SyntheticShot, camera: PinholeCamera) -> np.ndarray:
     """[N, 2] column and row of the pixels in the bounding box of the projected mesh."""
     px, _ = project(surface.mesh.vertices, shot.camera_from_head, camera.intrinsics)
     size = [camera.width, camera.height]
@@ -92,20 +93,20 @@ def _head_pixels(surface: Surface, shot: Shot, camera: Camera) -> np.ndarray:
     return np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1).reshape(-1, 2)
 
 
-def _camera_directions(points_px: np.ndarray, camera: Camera) -> np.ndarray:
+def _camera_directions(points_px: np.ndarray, camera: PinholeCamera) -> np.ndarray:
     """[..., 2] -> [..., 3] in camera space, z = 1."""
     offset = (points_px - [camera.width / 2, camera.height / 2]) / camera.focal_px
     return np.concatenate([offset, np.ones((*offset.shape[:-1], 1))], -1)
 
 
-def _background(light: EnvironmentLight, shot: Shot, camera: Camera) -> np.ndarray:
+def _background(light: EnvironmentLight, shot: SyntheticShot, camera: PinholeCamera) -> np.ndarray:
     """[H, W, 3] what the camera sees past the head: the light itself."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1) + 0.5
     world_from_camera = shot.world_from_head @ shot.camera_from_head[:3, :3].T
     return latlong_lookup(light.image, normalised(_camera_directions(pixels, camera)) @ world_from_camera.T)
 
 
-def _primary_hits(surface: Surface, shot: Shot, camera: Camera,
+def _primary_hits(surface: SyntheticSurface, shot: SyntheticShot, camera: PinholeCamera,
                   points_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Rays through image points [N, 2]: which hit [M], their head-space directions [M, 3] and what lies there."""
     rotation, translation = shot.camera_from_head[:3, :3], shot.camera_from_head[:3, 3]
@@ -120,7 +121,8 @@ def _primary_hits(surface: Surface, shot: Shot, camera: Camera,
                                   "mask": inside, "head": np.ones(len(hit), np.float32)}
 
 
-def _shade(surface: Surface, light: EnvironmentLight, irradiance: np.ndarray, shot: Shot, directions: np.ndarray,
+def _shade(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray, shot: SyntheticShot,
+           directions: np.ndarray,
            values: dict, samples: GlossSamples, choice: np.ndarray) -> np.ndarray:
     """[M, 3] radiance towards the camera: albedo / pi times irradiance, plus the glossy lobe."""
     gloss = glossy_radiance(surface, light, irradiance, shot.world_from_head, values["points"],

@@ -15,10 +15,10 @@ from shared.chart import COLUMNS, CORNERS, PATCHES, ROWS, reflectances
 from shared.geometry import fibonacci_sphere, project, rigid, rotation_from_vector
 from shared.raycast import RayScene
 from shared.texture import sample_bilinear
-from tools.synth_irradiance import Shot
+from tools.synth_irradiance import SyntheticShot
 from tools.synth_light import EnvironmentLight
 from tools.synth_sampling import shifted_hammersley
-from tools.synth_surface import Surface
+from tools.synth_surface import SyntheticSurface
 
 PITCH_MM, GAP, BORDER = 25.0, 0.12, 0.3
 """Distance of the patches, the gap between them and the border around them (both in pitches)."""
@@ -29,7 +29,7 @@ DIRECTIONS, LAMP_SAMPLES = 2048, 64
 
 
 @dataclass(frozen=True)
-class Chart:
+class PlacedChart:
     """camera_from_chart [4, 4]: the chart's x along the rows, y down, z away from the viewer; origin in its middle."""
 
     camera_from_chart: np.ndarray
@@ -41,7 +41,7 @@ class Chart:
             self.camera_from_chart[:3, 3])
 
 
-def place_chart(distance_mm: float, height_mm: float, seed: int) -> Chart:
+def place_chart(distance_mm: float, height_mm: float, seed: int) -> PlacedChart:
     """Beside the head at its depth, facing the camera but for some degrees; height_mm: as of synth_head.head_turn."""
     rng = np.random.default_rng([seed, 4])
     place = np.array([BESIDE_MM, height_mm - 15.0, distance_mm - 20.0])
@@ -49,11 +49,12 @@ def place_chart(distance_mm: float, height_mm: float, seed: int) -> Chart:
     nod, turn, roll = np.radians(rng.uniform(-1.0, 1.0, 3) * [8.0, 14.0, 6.0])
     rotation = rotation_from_vector(np.array([0.0, towards + turn, 0.0])) @ rotation_from_vector(
         np.array([nod, 0.0, 0.0])) @ rotation_from_vector(np.array([0.0, 0.0, roll]))
-    return Chart(rigid(rotation, place))
+    return PlacedChart(rigid(rotation, place))
 
 
-def add_chart(picture: np.ndarray, chart: Chart, surface: Surface, light: EnvironmentLight, irradiance: np.ndarray,
-              shot: Shot, intrinsics: np.ndarray, sub: int) -> None:
+def add_chart(picture: np.ndarray, chart: PlacedChart, surface: SyntheticSurface, light: EnvironmentLight,
+              irradiance: np.ndarray,
+              shot: SyntheticShot, intrinsics: np.ndarray, sub: int) -> None:
     """Draws the chart into a shot's radiance [H, W, 3], behind the head where that hides it; sub^2 rays per pixel.
 
     irradiance [size, size, 3]: of the head in this shot.
@@ -76,7 +77,7 @@ def add_chart(picture: np.ndarray, chart: Chart, surface: Surface, light: Enviro
     part += colour / sub**2
 
 
-def _shade(chart: Chart, head: RayScene, white: np.ndarray, shot: Shot, intrinsics: np.ndarray,
+def _shade(chart: PlacedChart, head: RayScene, white: np.ndarray, shot: SyntheticShot, intrinsics: np.ndarray,
            pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Image points [N, 2] -> bool [N], whether the chart is seen there, and its radiance [N, 3] (0 elsewhere)."""
     rays = np.column_stack([(pixels - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]], np.ones(len(pixels))])
@@ -100,8 +101,8 @@ def _shade(chart: Chart, head: RayScene, white: np.ndarray, shot: Shot, intrinsi
     return covered, reflectance * lit
 
 
-def chart_irradiance(chart: Chart, surface: Surface, light: EnvironmentLight, irradiance: np.ndarray,
-                     shot: Shot) -> np.ndarray:
+def chart_irradiance(chart: PlacedChart, surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray,
+                     shot: SyntheticShot) -> np.ndarray:
     """[5, 7, 3] irradiance at evenly spread points of the grid."""
     columns, rows = (np.linspace(0, length, count) for length, count in zip((COLUMNS, ROWS), NODES, strict=True))
     grid = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)

@@ -13,7 +13,7 @@ import numpy as np
 from shared import brdf
 from tools.synth_light import EnvironmentLight
 from tools.synth_sampling import shifted_hammersley, tangent_frame, visible_ggx_normal
-from tools.synth_surface import ShadingPoints, Surface, nearest_texel
+from tools.synth_surface import ShadingPoints, SyntheticSurface, nearest_texel
 
 SAMPLE_SETS = 64
 
@@ -44,7 +44,8 @@ class GlossSamples:
         return GlossSamples(self.lobe[:, every], self.lamp_directions[:, every], self.lamp_weights[:, every])
 
 
-def glossy_radiance(surface: Surface, light: EnvironmentLight, irradiance: np.ndarray, world_from_head: np.ndarray,
+def glossy_radiance(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray,
+                    world_from_head: np.ndarray,
                     points: ShadingPoints, outgoing: np.ndarray, roughness: np.ndarray, samples: GlossSamples,
                     choice: np.ndarray) -> np.ndarray:
     """[N, 3] radiance that the lobe at specular_intensity 1 sends towards `outgoing` [N, 3].
@@ -58,7 +59,8 @@ def glossy_radiance(surface: Surface, light: EnvironmentLight, irradiance: np.nd
     return smooth + lamps
 
 
-def _smooth_part(surface: Surface, light: EnvironmentLight, irradiance: np.ndarray, world_from_head: np.ndarray,
+def _smooth_part(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray,
+                 world_from_head: np.ndarray,
                  points: ShadingPoints, outgoing: np.ndarray, roughness: np.ndarray,
                  squares: np.ndarray) -> np.ndarray:
     """Visible-normal sampling: each sample's weight is F G1(i), the rest of the lobe cancels against its density."""
@@ -95,7 +97,7 @@ def sample_lobe(normal: np.ndarray, outgoing: np.ndarray, roughness: np.ndarray,
     return np.einsum("nkj,nji->nki", incoming, frame), weight.astype(np.float32)
 
 
-def _lamp_part(surface: Surface, points: ShadingPoints, outgoing: np.ndarray, roughness: np.ndarray,
+def _lamp_part(surface: SyntheticSurface, points: ShadingPoints, outgoing: np.ndarray, roughness: np.ndarray,
                directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Light sampling: the lobe's value towards each lamp sample [N, K, 3], times its weight."""
     cosine_out = (points.normal * outgoing).sum(1)[:, None]
@@ -110,7 +112,7 @@ def _lamp_part(surface: Surface, points: ShadingPoints, outgoing: np.ndarray, ro
     return np.einsum("nk,nkc->nc", lobe, weights) / directions.shape[1]
 
 
-def _radiosity(surface: Surface, irradiance: np.ndarray, uv: np.ndarray) -> np.ndarray:
+def _radiosity(surface: SyntheticSurface, irradiance: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """[N, 2] -> [N, 3] radiance that the surface itself sends out diffusely."""
     size = irradiance.shape[0]
     return surface.albedo(uv) * irradiance.reshape(-1, 3)[nearest_texel(uv, size)] / np.float32(np.pi)

@@ -22,13 +22,13 @@ from shared.geometry import fibonacci_sphere
 from shared.mesh import rasterize_uv
 from tools.synth_light import EnvironmentLight
 from tools.synth_sampling import random_rotation, shifted_hammersley
-from tools.synth_surface import ShadingPoints, Surface, nearest_texel
+from tools.synth_surface import ShadingPoints, SyntheticSurface, nearest_texel
 
 BATCH = 1024
 
 
 @dataclass(frozen=True)
-class Shot:
+class SyntheticShot:
     """One picture to take: camera_from_head [4, 4], world_from_head [3, 3], which light and the random seed."""
 
     camera_from_head: np.ndarray
@@ -56,14 +56,14 @@ class GroupResult:
     bounce: sparse.csr_matrix
 
 
-def covered_texels(surface: Surface, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def covered_texels(surface: SyntheticSurface, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Flat texel indices [T] that the UV layout covers, their face [T] and corner weights [T, 3]."""
     face, bary = rasterize_uv(surface.mesh, size)
     texels = np.nonzero(face.ravel() >= 0)[0]
     return texels, face.ravel()[texels], bary.reshape(-1, 3)[texels]
 
 
-def group_irradiance(surface: Surface, lights: list[EnvironmentLight], shots: list[Shot], group: int,
+def group_irradiance(surface: SyntheticSurface, lights: list[EnvironmentLight], shots: list[SyntheticShot], group: int,
                      quality: IrradianceQuality, seed: int) -> GroupResult:
     """Traces one of `quality.groups` groups of texels; independent of all others."""
     rng = np.random.default_rng([seed, group])
@@ -86,7 +86,7 @@ def group_irradiance(surface: Surface, lights: list[EnvironmentLight], shots: li
     return GroupResult(texels[chosen], np.concatenate(direct), sparse.vstack(rows, format="csr"))
 
 
-def _trace_directions(surface: Surface, points: ShadingPoints, directions: np.ndarray,
+def _trace_directions(surface: SyntheticSurface, points: ShadingPoints, directions: np.ndarray,
                       size: int) -> tuple[np.ndarray, sparse.csr_matrix]:
     """Cosines of unblocked directions [T, D] (0 where blocked), and form factors [T, size^2] to the texels hit."""
     cosine = points.normal @ directions.T
@@ -99,7 +99,7 @@ def _trace_directions(surface: Surface, points: ShadingPoints, directions: np.nd
     return visible, sparse.coo_matrix(entries, shape=(len(cosine), size * size)).tocsr()
 
 
-def _lamp_samples(lights: list[EnvironmentLight], shots: list[Shot], count: int,
+def _lamp_samples(lights: list[EnvironmentLight], shots: list[SyntheticShot], count: int,
                   rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Head-space directions [S, K, 3] and weights [S, K, 3] (1 / K included) of each shot's lamps."""
     points = shifted_hammersley(count, len(shots), rng)
@@ -108,13 +108,13 @@ def _lamp_samples(lights: list[EnvironmentLight], shots: list[Shot], count: int,
     return directions.astype(np.float32), np.stack([weight / count for _, weight in samples]).astype(np.float32)
 
 
-def _unblocked_lamps(lights: list[EnvironmentLight], shots: list[Shot], normals: np.ndarray) -> np.ndarray:
+def _unblocked_lamps(lights: list[EnvironmentLight], shots: list[SyntheticShot], normals: np.ndarray) -> np.ndarray:
     """[T, S, 3] irradiance of each shot's lamps on normals [T, 3] when nothing is in the way."""
     turned = (normals @ shot.world_from_head.T.astype(np.float32) for shot in shots)
     return np.stack([lights[shot.light].lamp_irradiance(world) for shot, world in zip(shots, turned, strict=True)], 1)
 
 
-def _visible_lamp_share(surface: Surface, points: ShadingPoints, directions: np.ndarray,
+def _visible_lamp_share(surface: SyntheticSurface, points: ShadingPoints, directions: np.ndarray,
                         weights: np.ndarray) -> np.ndarray:
     """[T, S, 3] which share of the lamps' irradiance arrives, from the lamp samples [S, K, 3].
 
@@ -135,7 +135,7 @@ def _visible_lamp_share(surface: Surface, points: ShadingPoints, directions: np.
     return arriving / np.maximum(sent, 1e-12)
 
 
-def assemble_atlas(surface: Surface, results: list[GroupResult], size: int) -> np.ndarray:
+def assemble_atlas(surface: SyntheticSurface, results: list[GroupResult], size: int) -> np.ndarray:
     """[size, size, S, 3] float32: direct light plus one bounce, borders of the UV islands continued outwards."""
     texels = np.concatenate([result.texels for result in results])
     shape = results[0].direct.shape[1:]

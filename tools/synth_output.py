@@ -14,7 +14,7 @@ from shared.io.arrays import save_arrays, write_json
 from shared.io.images import write_exr, write_png
 from shared.io.meshes import write_obj
 from shared.mesh import Mesh
-from tools.synth_camera import Camera
+from tools.synth_camera import PinholeCamera
 from tools.synth_render import Scene
 
 COVERAGES = ("mask", "head")
@@ -89,7 +89,7 @@ def write_environment(path: Path, image: np.ndarray) -> None:
     write_exr(path, image, colour_space="lin_rec709_scene", half=True, latlong=True)
 
 
-def write_description(folder: Path, camera: Camera, focal_mm: float, sensor_mm: float, frames: int, fps: float,
+def write_description(folder: Path, camera: PinholeCamera, focal_mm: float, sensor_mm: float, frames: int, fps: float,
                       video: str) -> None:
     """subject.yaml and capture.json: what is known about the clip without its truth."""
     (folder / "subject.yaml").write_text(
@@ -104,6 +104,6 @@ def write_description(folder: Path, camera: Camera, focal_mm: float, sensor_mm: 
         "color_space": "sRGB, 8 bit; linear radiance 1 = code 255; no tone mapping", "lens_distortion": "none"})
 
 
-def write_poses(path: Path, poses: np.ndarray, camera: Camera, truth_frames: np.ndarray) -> None:
+def write_poses(path: Path, poses: np.ndarray, camera: PinholeCamera, truth_frames: np.ndarray) -> None:
     """gt/poses.npz: camera_from_head [F, 4, 4], K [3, 3] and the frames that have buffers."""
     save_arrays(path, camera_from_head=poses, K=camera.intrinsics, gt_frames=np.asarray(truth_frames, np.int64))

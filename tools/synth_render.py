@@ -17,11 +17,11 @@ from functools import partial
 import numpy as np
 
 from shared.mesh import Mesh
-from tools.synth_camera import Camera, PictureQuality, take_picture
-from tools.synth_chart import Chart, add_chart
-from tools.synth_irradiance import GroupResult, IrradianceQuality, Shot, assemble_atlas, group_irradiance
+from tools.synth_camera import PictureQuality, PinholeCamera, take_picture
+from tools.synth_chart import PlacedChart, add_chart
+from tools.synth_irradiance import GroupResult, IrradianceQuality, SyntheticShot, assemble_atlas, group_irradiance
 from tools.synth_light import EnvironmentLight
-from tools.synth_surface import Materials, Surface
+from tools.synth_surface import Materials, SyntheticSurface
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -33,7 +33,7 @@ class Scene:
     mesh: Mesh
     materials: Materials
     lights: tuple[np.ndarray, ...]
-    chart: Chart | None = None
+    chart: PlacedChart | None = None
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class RenderQuality:
 class _Worker:
     """What a process needs to render: built once in each."""
 
-    def __init__(self, scene: Scene, shots: list[Shot], camera: Camera, quality: RenderQuality):
-        self.surface = Surface(scene.mesh, scene.materials)
+    def __init__(self, scene: Scene, shots: list[SyntheticShot], camera: PinholeCamera, quality: RenderQuality):
+        self.surface = SyntheticSurface(scene.mesh, scene.materials)
         self.lights = [EnvironmentLight(image) for image in scene.lights]
         self.chart = scene.chart
         self.shots, self.camera, self.quality = shots, camera, quality
@@ -83,12 +83,13 @@ def _call_worker(method: str, task: object) -> object:
     return getattr(_worker, method)(task)
 
 
-def render(scene: Scene, shots: list[Shot], camera: Camera, quality: RenderQuality, with_buffers: list[bool],
+def render(scene: Scene, shots: list[SyntheticShot], camera: PinholeCamera, quality: RenderQuality,
+           with_buffers: list[bool],
            processes: int) -> Iterator[dict[str, np.ndarray]]:
     """The images of each shot, in order: radiance [H, W, 3], and where wanted the buffers of take_picture."""
     with _workers(processes, (scene, shots, camera, quality)) as spread:
         groups = list(spread("irradiance", range(quality.irradiance.groups)))
-        surface = Surface(scene.mesh, scene.materials)
+        surface = SyntheticSurface(scene.mesh, scene.materials)
         atlas = assemble_atlas(surface, groups, quality.irradiance.size)
         del groups
         tasks = ((i, np.ascontiguousarray(atlas[:, :, i]), with_buffers[i]) for i in range(len(shots)))

@@ -43,7 +43,7 @@ class ShadingPoints:
         return ShadingPoints(self.position[index], self.normal[index], self.geometric_normal[index], self.uv[index])
 
 
-class Surface:
+class SyntheticSurface:
     """A textured mesh in head space that rays can be shot at."""
 
     def __init__(self, mesh: Mesh, materials: Materials):

@@ -31,10 +31,10 @@ from shared.head_model import HeadModel
 from shared.io.arrays import save_arrays, write_json
 from shared.io.models import load_head_model
 from tools import synth_output
-from tools.synth_camera import Camera, PictureQuality
+from tools.synth_camera import PictureQuality, PinholeCamera
 from tools.synth_chart import place_chart
 from tools.synth_head import PITCH_DEG, YAW_DEG, Head, face_part, head_turn, random_head
-from tools.synth_irradiance import IrradianceQuality, Shot
+from tools.synth_irradiance import IrradianceQuality, SyntheticShot
 from tools.synth_light import ENVIRONMENTS, procedural_environment
 from tools.synth_render import RenderQuality, Scene, render
 from tools.synth_skin import Complexion, SkinPainter
@@ -52,7 +52,7 @@ RELIGHT_YAWS_DEG = {"front": 0.0, "left15": -15.0, "right15": 15.0}
 
 
 @dataclass(frozen=True)
-class Settings:
+class SynthesisSettings:
     """Everything that decides the result.
 
     level: subdivisions of the head model. noise: standard deviation of the sensor at full scale. lights: the clip's,
@@ -85,17 +85,18 @@ class Settings:
 
 
 PRESETS = {
-    "demo": Settings(),
-    "tiny": Settings(size=144, frames=12, level=0, texture=128, truth_frames=1, mantissa_bits=4,
-                     face_truth_only=True, lights=("room",), light_height=32, noise=0.0015, video="frames/%04d.png",
-                     irradiance=IrradianceQuality(size=160, directions=768)),
+    "demo": SynthesisSettings(),
+    "tiny": SynthesisSettings(size=144, frames=12, level=0, texture=128, truth_frames=1, mantissa_bits=4,
+                              face_truth_only=True, lights=("room",), light_height=32, noise=0.0015,
+                              video="frames/%04d.png",
+                              irradiance=IrradianceQuality(size=160, directions=768)),
 }
 
 
-def synthesize(destination: Path, settings: Settings, processes: int) -> None:
+def synthesize(destination: Path, settings: SynthesisSettings, processes: int) -> None:
     """Makes the subject in `destination`, which may not hold one yet. Errors: InputError."""
     if (destination / "subject.yaml").exists():
-        raise InputError("holds a subject already", where=str(destination), mend="choose another folder or remove it")
+        raise InputError("holds a subject already", where=str(destination), hint="choose another folder or remove it")
     head = random_head(head_model(settings.level), settings.seed, settings.eyes == "closed")
     materials = SkinPainter(head, settings.texture, settings.seed).paint(Complexion(tone=settings.tone))
     materials = replace(materials, specular=settings.gloss * materials.specular)
@@ -104,7 +105,7 @@ def synthesize(destination: Path, settings: Settings, processes: int) -> None:
     chart = place_chart(distance, height, settings.seed) if settings.chart else None
     scene = Scene(head.mesh, materials, lights, chart)
     width = round(WITH_CHART * settings.size) if settings.chart else settings.size
-    camera = Camera(width, settings.size, settings.focal_mm / SENSOR_MM * settings.size)
+    camera = PinholeCamera(width, settings.size, settings.focal_mm / SENSOR_MM * settings.size)
     shots = plan_shots(head, settings)
     truth = np.unique(np.linspace(0, settings.frames - 1, settings.truth_frames).round().astype(int))
     destination.mkdir(parents=True, exist_ok=True)
@@ -120,11 +121,13 @@ def synthesize(destination: Path, settings: Settings, processes: int) -> None:
         _write_relight(destination / "relight", settings, scene, shots[settings.frames:], pictures)
     write_json(destination / "synthesis.json", asdict(settings))
     # Last, so that an interrupted run leaves no subject.
-    lens = settings.focal_mm, SENSOR_MM * width / settings.size
-    synth_output.write_description(destination, camera, *lens, settings.frames, FPS, settings.video)
+    synth_output.write_description(
+        destination, camera, focal_mm=settings.focal_mm, sensor_mm=SENSOR_MM * width / settings.size,
+        frames=settings.frames, fps=FPS, video=settings.video,
+    )
 
 
-def _write_clip(destination: Path, settings: Settings, camera: Camera, truth: np.ndarray,
+def _write_clip(destination: Path, settings: SynthesisSettings, camera: PinholeCamera, truth: np.ndarray,
                 pictures: Iterable[dict[str, np.ndarray]]) -> None:
     clip = synth_output.ClipWriter(destination / settings.video, (camera.width, camera.height), FPS)
     for index, images in enumerate(tqdm(pictures, "frames", settings.frames, disable=None)):
@@ -135,7 +138,7 @@ def _write_clip(destination: Path, settings: Settings, camera: Camera, truth: np
     clip.close()
 
 
-def _write_relight(folder: Path, settings: Settings, scene: Scene, shots: list[Shot],
+def _write_relight(folder: Path, settings: SynthesisSettings, scene: Scene, shots: list[SyntheticShot],
                    pictures: Iterable[dict[str, np.ndarray]]) -> None:
     folder.mkdir(exist_ok=True)
     for name, light in zip(settings.lights[1:], scene.lights[1:], strict=True):
@@ -155,7 +158,7 @@ def head_model(level: int) -> HeadModel:
     return model
 
 
-def light_of(name: str, settings: Settings) -> np.ndarray:
+def light_of(name: str, settings: SynthesisSettings) -> np.ndarray:
     """The named environment, scaled so that skin that faces the camera has a radiance of FACE_RADIANCE."""
     environment = procedural_environment(name, settings.seed, settings.light_height)
     directions = latlong_directions(environment.shape[0])
@@ -166,13 +169,13 @@ def light_of(name: str, settings: Settings) -> np.ndarray:
     return (environment * (FACE_RADIANCE * np.pi / (irradiance * skin_albedo))).astype(np.float32)
 
 
-def camera_place(head: Head, settings: Settings) -> tuple[float, float]:
+def camera_place(head: Head, settings: SynthesisSettings) -> tuple[float, float]:
     """The camera's distance from the head's origin and its height above it, mm."""
     height = head.mesh.vertices[:, 1].max() + TOP_MARGIN_MM - 0.5 * SENSOR_MM * DISTANCE_PER_FOCAL
     return DISTANCE_PER_FOCAL * settings.focal_mm, height
 
 
-def plan_shots(head: Head, settings: Settings) -> list[Shot]:
+def plan_shots(head: Head, settings: SynthesisSettings) -> list[SyntheticShot]:
     """The clip's frames, then three views under each further light."""
     distance, height = camera_place(head, settings)
     poses = list(head_turn(settings.frames, distance, height, settings.seed, settings.yaw_deg, settings.pitch_deg))
@@ -181,7 +184,7 @@ def plan_shots(head: Head, settings: Settings) -> list[Shot]:
         poses += [relight_pose(yaw, height, distance) for yaw in RELIGHT_YAWS_DEG.values()]
         light += [index] * len(RELIGHT_YAWS_DEG)
     turns = world_from_head(np.stack(poses), "head")
-    return [Shot(pose, turn, which, settings.seed * 1000 + i)
+    return [SyntheticShot(pose, turn, which, settings.seed * 1000 + i)
             for i, (pose, turn, which) in enumerate(zip(poses, turns, light, strict=True))]
 
 
@@ -192,7 +195,7 @@ def relight_pose(yaw_deg: float, height_mm: float, distance_mm: float) -> np.nda
     return rigid(flip @ turn, np.array([0.0, height_mm, distance_mm]))
 
 
-def parse(arguments: list[str] | None) -> tuple[Path, Settings, int]:
+def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
     """Command line -> destination, settings, number of processes."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("destination", type=Path, help="folder of the new subject")
@@ -222,7 +225,7 @@ def parse(arguments: list[str] | None) -> tuple[Path, Settings, int]:
     return options.destination, _checked(settings), options.processes
 
 
-def _checked(settings: Settings) -> Settings:
+def _checked(settings: SynthesisSettings) -> SynthesisSettings:
     for name, low, high in (("size", 64, 2048), ("frames", 8, 1000), ("seed", 0, 10**6), ("tone", 0.05, 2.0),
                             ("noise", 0.0, 0.1), ("focal_mm", 15.0, 500.0), ("yaw_deg", 0.0, 60.0),
                             ("pitch_deg", 0.0, 40.0), ("gloss", 0.0, 2.0)):

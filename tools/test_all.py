@@ -31,7 +31,7 @@ BPY = "bpy==5.0.1"
 
 
 @dataclass(frozen=True)
-class Part:
+class OptionalPart:
     """commands: run in turn while `is_there` is false."""
 
     name: str
@@ -70,22 +70,22 @@ def debian(*packages: str) -> tuple[str, ...]:
 
 
 PARTS = (
-    Part("Chromium", has_program("chromium"), (debian("chromium"),)),
-    Part("OpenEXR's tools", has_program("exrheader"), (debian("openexr"),)),
-    Part("LLVM 19 and TBB", lambda: llvm() is not None and any(Path("/usr/lib").glob("*/libtbb.so.12")),
-         (debian("libllvm19", "libtbb12"),)),
-    Part("Mitsuba", has_module("mitsuba", "drjit"), ((*PIP, *PEERS),)),
-    Part("Blender", blender_imports, (
+    OptionalPart("Chromium", has_program("chromium"), (debian("chromium"),)),
+    OptionalPart("OpenEXR's tools", has_program("exrheader"), (debian("openexr"),)),
+    OptionalPart("LLVM 19 and TBB", lambda: llvm() is not None and any(Path("/usr/lib").glob("*/libtbb.so.12")),
+                 (debian("libllvm19", "libtbb12"),)),
+    OptionalPart("Mitsuba", has_module("mitsuba", "drjit"), ((*PIP, *PEERS),)),
+    OptionalPart("Blender", blender_imports, (
         debian("libgl1", "libx11-6", "libxi6", "libxrender1", "libxfixes3", "libsm6", "libxkbcommon0"),
         (sys.executable, "-m", "venv", BLENDER),
         (BLENDER / "bin" / "python", "-m", "pip", "install", "--quiet", BPY))),
-    Part("Slurm and munge", has_program("slurmctld", "slurmd", "munged"), (debian("slurm-wlm", "munge"),)),
-    Part("Slurm's executor", has_module("snakemake_executor_plugin_slurm"),
-         ((*PIP, "--require-hashes", "--requirement", REPOSITORY / "requirements-cluster.lock"),)),
+    OptionalPart("Slurm and munge", has_program("slurmctld", "slurmd", "munged"), (debian("slurm-wlm", "munge"),)),
+    OptionalPart("Slurm's executor", has_module("snakemake_executor_plugin_slurm"),
+                 ((*PIP, "--require-hashes", "--requirement", REPOSITORY / "requirements-cluster.lock"),)),
 )
 
 
-def install(part: Part) -> str:
+def install(part: OptionalPart) -> str:
     """Why the part is not there after its commands; '' where it is."""
     for command in part.commands if not part.is_there() else ():
         try:

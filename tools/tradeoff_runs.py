@@ -36,7 +36,7 @@ PEER_CODE = ("tools/peer_inverse.py", "tools/peer_mitsuba.py")
 
 
 @dataclass(frozen=True)
-class Cost:
+class ProcessCost:
     """wall_s, cpu_s and peak_mb of one process and its children; others: cores that other work kept busy meanwhile."""
 
     wall_s: float
@@ -52,7 +52,7 @@ class Solved:
 
     folder: Path
     digest: str
-    costs: Mapping[str, Cost]
+    costs: Mapping[str, ProcessCost]
     code: Mapping[str, str]
     at: float | None = None
 
@@ -93,7 +93,7 @@ class Runs:
             key = hash_value([key, name, parameters[name], len(os.sched_getaffinity(0))])[:16]
             node = self._stage(name, case, key, node, code)
             record = read_json(node / MEASURED)
-            costs[name], code = Cost(**record["cost"]), record["code"]
+            costs[name], code = ProcessCost(**record["cost"]), record["code"]
         if case.seconds:
             return self._peer(case, key, node, costs, code)
         root = node / self.subject.name
@@ -147,7 +147,7 @@ class Runs:
         others = read_json(node / MEASURED)["cost"]["others"]
         found = []
         for at, folder in places.items():
-            cost = costs | {case.name: Cost(**read_json(folder / COST), others=others)}
+            cost = costs | {case.name: ProcessCost(**read_json(folder / COST), others=others)}
             digest = hash_value([hash_file(path) for path in sorted(folder.rglob("*.*")) if path.name != COST])
             found.append(Solved(folder, digest, cost, own, at))
         return found
@@ -179,7 +179,7 @@ def measured(command: Sequence[str], log: Path) -> dict[str, float]:
     if process.returncode:
         words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no message"]
         ended = f"exit code {process.returncode}; its log: {log}"
-        raise InputError("failed", where=" ".join(command[:6]), got=words[-1], mend=ended)
+        raise InputError("failed", where=" ".join(command[:6]), got=words[-1], hint=ended)
     others = max(0.0, (_busy_seconds() - busy - cpu) / wall)
     return {"wall_s": round(wall, 3), "cpu_s": round(cpu, 3), "others": round(others, 2)}
 

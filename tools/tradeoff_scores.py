@@ -20,7 +20,7 @@ from shared.io.arrays import load_arrays
 from shared.io.images import read_exr, read_png, write_exr
 from shared.io.meshes import write_obj
 from shared.solve.capture import Sizes
-from shared.solve.views import Camera, HeadViews
+from shared.solve.views import HeadViews, ViewCamera
 from tools.bench_relight import result_poses
 from tools.relight_inputs import Asset, open_asset
 from tools.score import camera_intrinsics, score
@@ -37,12 +37,12 @@ CODE = ("tools/tradeoff_scores.py", "tools/score.py", "tools/score_align.py", "t
 
 
 @dataclass(frozen=True)
-class Shot:
+class ScoredShot:
     """A picture to make: its file below the result, camera, light [H, 2 H, 3], what moves against it, and where the
     truth has face skin [h, w]."""
 
     file: str
-    camera: Camera
+    camera: ViewCamera
     light: np.ndarray
     moves: str
     skin: np.ndarray
@@ -63,7 +63,7 @@ def scores_of(subject: Path, result: Path) -> dict[str, float]:
         return flat(score(subject, export, SCORED_FRAMES, prepare=make_pictures))
 
 
-def clip_shots(subject: Path, asset: Asset) -> list[Shot]:
+def clip_shots(subject: Path, asset: Asset) -> list[ScoredShot]:
     """Some of the frames that hold truth, through the result's lens, under its light."""
     place = {int(frame): k for k, frame in enumerate(asset.frame_index)}
     known = [int(frame) for frame in load_arrays(subject / "gt" / "poses.npz")["gt_frames"] if int(frame) in place]
@@ -71,24 +71,24 @@ def clip_shots(subject: Path, asset: Asset) -> list[Shot]:
     shots = []
     for frame in (known[k] for k in chosen):
         skin = read_png(subject / "gt" / "frames" / f"{frame:04d}_mask.png") > 127
-        camera = Camera(asset.poses[place[frame]], asset.intrinsics, skin.shape[::-1])
-        shots.append(Shot(f"renders/{frame:04d}.exr", camera, asset.envmap, asset.moves, skin))
+        camera = ViewCamera(asset.poses[place[frame]], asset.intrinsics, skin.shape[::-1])
+        shots.append(ScoredShot(f"renders/{frame:04d}.exr", camera, asset.envmap, asset.moves, skin))
     return shots
 
 
-def relit_shots(subject: Path, alignment: Similarity) -> list[Shot]:
+def relit_shots(subject: Path, alignment: Similarity) -> list[ScoredShot]:
     """The front view of relight/ under each of its lights, in the result's head space."""
     shots = []
     for path in sorted((subject / "relight").glob("*_envmap.exr")):
         name = f"{path.name.removesuffix('_envmap.exr')}_{RELIT_VIEW}"
         pose = load_arrays(subject / "relight" / "poses.npz")[RELIT_VIEW]
         skin = read_png(subject / "relight" / f"{name}_mask.png") > 127
-        camera = Camera(result_poses(pose[None], alignment)[0], camera_intrinsics(subject), skin.shape[::-1])
-        shots.append(Shot(f"relit/{name}.exr", camera, read_exr(path).astype(np.float64), "head", skin))
+        camera = ViewCamera(result_poses(pose[None], alignment)[0], camera_intrinsics(subject), skin.shape[::-1])
+        shots.append(ScoredShot(f"relit/{name}.exr", camera, read_exr(path).astype(np.float64), "head", skin))
     return shots
 
 
-def render_shots(asset: Asset, shots: list[Shot], export: Path) -> None:
+def render_shots(asset: Asset, shots: list[ScoredShot], export: Path) -> None:
     """Writes the pictures; only what shows in face skin is shaded with care."""
     near = [_projects_into(asset.mesh.vertices, shot) for shot in shots]
     views = HeadViews(asset.mesh, asset.maps, SIZES, [shot.camera for shot in shots], only=np.any(near, axis=0))
@@ -99,7 +99,7 @@ def render_shots(asset: Asset, shots: list[Shot], export: Path) -> None:
         write_exr(path, picture.astype(np.float32), colour_space="lin_rec709_scene")
 
 
-def _projects_into(points: np.ndarray, shot: Shot) -> np.ndarray:
+def _projects_into(points: np.ndarray, shot: ScoredShot) -> np.ndarray:
     """[N] whether points [N, 3] land in the skin of a shot or within REACH_PX of it."""
     reach = np.ones((2 * REACH_PX + 1,) * 2, np.uint8)
     skin = cv2.dilate(shot.skin.astype(np.uint8), reach) > 0

@@ -23,7 +23,7 @@ _STYLE = (
 )
 
 
-class Scale:
+class Axis:
     """Value -> place along an axis, logarithmic where told; kept within its ends."""
 
     def __init__(self, low: float, high: float, start: float, end: float, logarithmic: bool):
@@ -53,8 +53,8 @@ def tradeoff_svg(
     margin = 0.08 * (max(values) - min(values)) or 0.5
     y_span = (min(values) / 1.1, max(values) * 1.1) if spread else (min(values) - margin, max(values) + margin)
     x_span = min(costs) / 1.25, max(costs) * 1.25
-    across = Scale(*x_span, LEFT, WIDTH - RIGHT, logarithmic=True)
-    down = Scale(*y_span, HEIGHT - BOTTOM, TOP, logarithmic=spread)
+    across = Axis(*x_span, LEFT, WIDTH - RIGHT, logarithmic=True)
+    down = Axis(*y_span, HEIGHT - BOTTOM, TOP, logarithmic=spread)
     places = {point["name"]: (across(point[cost]), down(point["scores"][measure])) for point in points}
     front = pareto_front(points, measure, cost)
     y_ticks = log_ticks(*y_span, (1, 1.5, 2, 3, 5, 7)) if spread else nice_ticks(*y_span)
@@ -73,7 +73,7 @@ def is_spread(values: Sequence[float]) -> bool:
     return min(values) > 0.0 and max(values) > SPREAD * min(values)
 
 
-def _ticks(across: Scale, down: Scale, x_ticks: Iterable[float], y_ticks: Iterable[float]) -> list[str]:
+def _ticks(across: Axis, down: Axis, x_ticks: Iterable[float], y_ticks: Iterable[float]) -> list[str]:
     bottom, parts = HEIGHT - BOTTOM, []
     for tick in x_ticks:
         x = across(tick)
@@ -101,7 +101,7 @@ def _front(places: Sequence[tuple[float, float]]) -> str:
     return f'<path class="front" d="{path}"/>'
 
 
-def _point(point: Mapping, place: tuple[float, float], across: Scale, cost: str) -> str:
+def _point(point: Mapping, place: tuple[float, float], across: Axis, cost: str) -> str:
     (x, y), colour = place, GROUP_COLOURS[point["group"]]
     first, last = (across(value) for value in point["ranges"][cost])
     radius = 6.5 if point["group"] == PRESET else 4

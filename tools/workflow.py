@@ -22,9 +22,9 @@ from shared.contract.folders import RunFolder
 from shared.contract.manifest import LOG, MANIFEST
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
-from tools.cases import Case, InputErrors, Opened, no_access, one_line
+from tools.cases import InputErrors, Opened, SubjectCase, no_access, one_line
 from tools.cluster import keep_slurm_logs
-from tools.engine import SCRATCH, Settings, configure, run_engine, scratch_folder
+from tools.engine import SCRATCH, EngineSettings, configure, run_engine, scratch_folder
 from tools.outcome import Outcome, at_fault, exit_code, outcome_of, write_summary
 from tools.overview import page_beside, write_overview
 from tools.plan import CURRENT, StagePlan, kept_lines, plan_case
@@ -35,14 +35,14 @@ _DYING_S = 2.0
 _WORKFLOW_LOG = "workflow.log"
 
 
-def run_cases(opened: Opened, settings: Settings) -> int:
+def run_cases(opened: Opened, settings: EngineSettings) -> int:
     """Brings every subject up to date, whatever becomes of the others; returns the exit code, see tools/outcome.py."""
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _interrupt)
     start, started = time.monotonic(), datetime.now(UTC).isoformat(timespec="seconds")
     faults, crashed = list(opened.faults), []
     with contextlib.ExitStack() as stack:
-        planned: list[tuple[Case, dict[str, StagePlan]]] = []
+        planned: list[tuple[SubjectCase, dict[str, StagePlan]]] = []
         for case in opened.cases:
             try:
                 planned.append((case, _begin(stack, case, settings)))
@@ -66,7 +66,7 @@ def run_cases(opened: Opened, settings: Settings) -> int:
     return _finish(outcomes, settings, started, time.monotonic() - start)
 
 
-def _finish(outcomes: Sequence[Outcome], settings: Settings, started: str, seconds: float) -> int:
+def _finish(outcomes: Sequence[Outcome], settings: EngineSettings, started: str, seconds: float) -> int:
     """The table, summary.json and the page beside it; returns the exit code."""
     if len(outcomes) > 1 or any(outcome.flags for outcome in outcomes):
         _say("\n".join(table_lines(outcomes)))
@@ -81,7 +81,7 @@ def _finish(outcomes: Sequence[Outcome], settings: Settings, started: str, secon
     return exit_code(outcomes)
 
 
-def _begin(stack: contextlib.ExitStack, case: Case, settings: Settings) -> dict[str, StagePlan]:
+def _begin(stack: contextlib.ExitStack, case: SubjectCase, settings: EngineSettings) -> dict[str, StagePlan]:
     """Locks the subject, clears what killed runs left, plans; InputError where that cannot be."""
     with contextlib.ExitStack() as own:
         own.enter_context(case.run.locked("run"))
@@ -97,7 +97,7 @@ def _begin(stack: contextlib.ExitStack, case: Case, settings: Settings) -> dict[
     return plan
 
 
-def clear_all_leftovers(case: Case, pipeline: Pipeline, keep_logs: bool = True) -> None:
+def clear_all_leftovers(case: SubjectCase, pipeline: Pipeline, keep_logs: bool = True) -> None:
     """The same for the subject's folder and for those of its clips."""
     for run in dict.fromkeys(part.run for part, _ in case.jobs(pipeline)):
         clear_leftovers(run, pipeline, keep_logs)
@@ -132,7 +132,7 @@ def is_current(plans: Mapping[str, StagePlan]) -> bool:
     return all(plan.state == CURRENT for plan in plans.values())
 
 
-def _run_waiting(cases: Sequence[Case], settings: Settings, start: float) -> dict[str, Outcome]:
+def _run_waiting(cases: Sequence[SubjectCase], settings: EngineSettings, start: float) -> dict[str, Outcome]:
     """Lets the engine work on the subjects that are not current and says how each ended."""
     with contextlib.ExitStack() as stack:
         scratches = [stack.enter_context(scratch_folder(case.run)) for case in cases]
@@ -154,7 +154,7 @@ def _run_waiting(cases: Sequence[Case], settings: Settings, start: float) -> dic
                 for case, own in zip(cases, tracks, strict=True)}
 
 
-def _guarded(case: Case, judged: Callable[[], Outcome]) -> Outcome:
+def _guarded(case: SubjectCase, judged: Callable[[], Outcome]) -> Outcome:
     """The outcome of one subject, whatever its records do to us on the way: that is its own, and stops no other."""
     try:
         return judged()
@@ -168,7 +168,7 @@ def _guarded(case: Case, judged: Callable[[], Outcome]) -> Outcome:
     return at_fault(case.subject.folder, fault)
 
 
-def _crash(case: Case, error: Exception) -> Outcome:
+def _crash(case: SubjectCase, error: Exception) -> Outcome:
     """A subject on which we failed: the trace goes to its log, or to stderr where that cannot be written."""
     log, text = case.run.work / _WORKFLOW_LOG, "".join(traceback.format_exception(error))
     try:
@@ -182,7 +182,7 @@ def _crash(case: Case, error: Exception) -> Outcome:
     return at_fault(case.subject.folder, one_line(error), "failed", str(log or ""))
 
 
-def _conclude(case: Case, tracks: Sequence[Track], settings: Settings, log: Path, seconds: float,
+def _conclude(case: SubjectCase, tracks: Sequence[Track], settings: EngineSettings, log: Path, seconds: float,
               interrupted: bool) -> Outcome:
     """Keeps the engine's log and says how the subject's run ended."""
     plans = plan_case(settings.pipeline, case, settings.parameters, renew=settings.renew)
@@ -209,7 +209,7 @@ def _conclude(case: Case, tracks: Sequence[Track], settings: Settings, log: Path
     return outcome
 
 
-def _say_kept(case: Case, plans: Mapping[str, StagePlan]) -> None:
+def _say_kept(case: SubjectCase, plans: Mapping[str, StagePlan]) -> None:
     """Names the results that are kept although other code or packages made them."""
     lines = kept_lines(plans)
     for line in lines:
@@ -218,7 +218,7 @@ def _say_kept(case: Case, plans: Mapping[str, StagePlan]) -> None:
         _say(f"{case.name}: to have {'it' if len(lines) == 1 else 'them'} anew: limn run --renew")
 
 
-def _result(case: Case, plans: Mapping[str, StagePlan]) -> Path:
+def _result(case: SubjectCase, plans: Mapping[str, StagePlan]) -> Path:
     """The last stage's report where there is one, else its folder; the run's folder where clips have one each."""
     last = list(plans.values())[-1]
     if last.case.clip:
@@ -255,7 +255,7 @@ def default_summary(subjects: Sequence[Path], out: Path | None, given: Path | No
     free = [folder / name for name in names
             if all(path not in results and not path.is_dir() for path in (folder / name, page_beside(folder / name)))]
     if not free:
-        raise InputError("no free name for the summary", where=str(folder), mend="name a place with --summary FILE")
+        raise InputError("no free name for the summary", where=str(folder), hint="name a place with --summary FILE")
     if free[0].name != names[0]:
         _say(f"limn: {folder / names[0]}, or the page beside it, is a folder: the summary goes to {free[0]}")
     return free[0]

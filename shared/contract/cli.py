@@ -105,15 +105,18 @@ def answer_current(request: Request) -> bool:
     return True
 
 
-class _OneLineParser(argparse.ArgumentParser):
+class OneLineParser(argparse.ArgumentParser):
+    """A parser whose complaint is an InputError of one line instead of the usage."""
+
     def error(self, message: str) -> None:
-        raise InputError(message, mend="see --help")
+        """argparse's hook for a bad command line. InputError always."""
+        raise InputError(message, hint=f"see {self.prog} --help")
 
 
 def make_parser(stage: Stage) -> argparse.ArgumentParser:
     """The stage's command line, with its parameters in the help text."""
     lines = [f"  {p.name:24} {p.help} Default {p.default}; {p.expected}." for p in stage.parameters]
-    parser = _OneLineParser(prog=f"python -m stages.{stage.name}", description=stage.help,
+    parser = OneLineParser(prog=f"python -m stages.{stage.name}", description=stage.help,
                             epilog="parameters:\n" + "\n".join(lines), formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--subject", type=Path, required=True, metavar="DIR", help="folder with subject.yaml")
     parser.add_argument("--clip", metavar="NAME", help="which clip, where subject.yaml names several")
@@ -153,11 +156,11 @@ def _part(stage: Stage, subject: Subject, run: RunFolder, clip: str | None, join
     """What of a subject with several clips the stage works on: all of it, or the one clip that is named."""
     if joint:
         if clip is not None:
-            raise InputError("works on all clips together", where=f"{stage.name} --clip", mend="leave --clip out")
+            raise InputError("works on all clips together", where=f"{stage.name} --clip", hint="leave --clip out")
         return subject, run
     if clip is None:
         raise InputError("works on one clip at a time", where=stage.name, got=f"{len(subject.clips)} clips",
-                         mend=f"add --clip NAME, one of {', '.join(clip.name for clip in subject.clips)}")
+                         hint=f"add --clip NAME, one of {', '.join(clip.name for clip in subject.clips)}")
     return subject.clip(clip, "--clip"), run.of_clip(clip)
 
 

@@ -53,7 +53,7 @@ def check_link(path: Path, folder: Path) -> None:
     real, home = Path(os.path.realpath(path)), Path(os.path.realpath(folder))
     if not real.is_relative_to(home) and not is_trusted(real):
         raise InputError("a symbolic link leads out of the subject's folder", where=str(path), got=f"-> {real}",
-                         mend=f"copy the file, or vouch for its folder: --trust {real.parent}")
+                         hint=f"copy the file, or vouch for its folder: --trust {real.parent}")
 
 
 def check_results(root: Path, work: Path) -> None:
@@ -65,15 +65,15 @@ def check_results(root: Path, work: Path) -> None:
         _check_links(root, work)
     except OSError as error:
         raise InputError("cannot be read", where=str(error.filename or work), got=error.strerror,
-                         mend="check its permissions, or write elsewhere with --out DIR") from error
+                         hint="check its permissions, or write elsewhere with --out DIR") from error
 
 
 def _check_links(root: Path, work: Path) -> None:
     for path in (work, root / "export"):
         if path.is_symlink() and not is_trusted(path):
             raise InputError("a symbolic link in place of results", where=str(path), got=f"-> {os.path.realpath(path)}",
-                             mend=f"remove it, or vouch for where it leads: --trust {os.path.realpath(path)}")
+                             hint=f"remove it, or vouch for where it leads: --trust {os.path.realpath(path)}")
     if work.is_dir():
         for entry in os.scandir(work):
             if entry.is_symlink():
-                raise InputError("a symbolic link in place of results", where=entry.path, mend="remove it")
+                raise InputError("a symbolic link in place of results", where=entry.path, hint="remove it")

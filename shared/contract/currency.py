@@ -27,7 +27,7 @@ def input_hashes(stage: Stage, subject: Subject, run: RunFolder, parameters: Map
         manifest = read_manifest(folder)
         faults = ["has no result yet"] if manifest is None else damage(folder, manifest, memory)
         if faults:
-            raise InputError(f"input {name}: {faults[0]}", where=str(folder), mend="limn run makes it again")
+            raise InputError(f"input {name}: {faults[0]}", where=str(folder), hint="limn run makes it again")
         inputs[name] = outputs_digest(manifest)
     return inputs
 

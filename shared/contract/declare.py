@@ -30,7 +30,8 @@ class Parameter:
 
     type: int, float, bool or str. help: one sentence. unit: '' for counts, ratios and names. minimum, maximum:
     inclusive. choices: all allowed values. file: the text names a file; only a command line may do that, never
-    pipeline.yaml, and the file's content counts as an input. Its path becomes absolute.
+    pipeline.yaml, and the file's content counts as an input. Its path becomes absolute. former: the name that it had
+    before, which is refused with a line that names the new one.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Parameter:
     maximum: float | None = None
     choices: tuple = ()
     file: bool = False
+    former: str = ""
 
     def __post_init__(self) -> None:
         if not _NAME.match(self.name) or self.type not in _KIND or not self.help:
@@ -162,7 +164,7 @@ class Stage:
         if all(p.name != SEED.name for p in parameters):
             parameters += (SEED,)
         object.__setattr__(self, "parameters", parameters)
-        names = [p.name for p in parameters]
+        names = [p.name for p in parameters] + [p.former for p in parameters if p.former]
         if not set(self.joins) <= set(self.inputs):
             raise ValueError(f"stage {self.name!r} joins what is not among its inputs")
         if not _NAME.match(self.name) or not self.help or not self.outputs or len(set(names)) != len(names):
@@ -188,7 +190,11 @@ class Stage:
         where: what the values come from, in words; the parameter's name is added.
         """
         known = {p.name: p for p in self.parameters}
+        renamed = {p.former: p.name for p in self.parameters if p.former}
         for name in values:
+            if name in renamed:
+                raise InputError(f"parameter {self.name}.{name} has another name now", where=where,
+                                 hint=f"write {self.name}.{renamed[name]}")
             if name not in known:
                 raise unknown_name("parameter", f"{self.name}.{name}", [f"{self.name}.{key}" for key in known], where)
         return {name: known[name].parse(value, f"{where}: {self.name}.{name}") for name, value in values.items()}

@@ -10,7 +10,7 @@ from pathlib import Path
 from shared.errors import InputError
 
 FULL_BELOW_BYTES = 1 << 20
-_MEND = "free some (limn clean), or write elsewhere with --out DIR"
+_HINT = "free some (limn clean), or write elsewhere with --out DIR"
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _CLOSED = (errno.EROFS, errno.EACCES, errno.EPERM)
 _BROKEN = (errno.EIO, errno.ESTALE)
@@ -26,7 +26,7 @@ def check_space(path: Path, needed_mb: float | None) -> None:
     """InputError where less is free than a stage is expected to write; nothing is checked for None."""
     if needed_mb is not None and free_bytes(path) < needed_mb * 1e6:
         raise InputError("not enough space on the disk", where=str(path), got=f"{free_bytes(path) / 1e6:.0f} MB",
-                         expected=f"about {needed_mb:.0f} MB", mend=_MEND)
+                         expected=f"about {needed_mb:.0f} MB", hint=_HINT)
 
 
 def disk_fault(error: BaseException, path: Path) -> InputError | None:
@@ -41,10 +41,10 @@ def disk_fault(error: BaseException, path: Path) -> InputError | None:
     numbers = {cause.errno for cause in causes if isinstance(cause, OSError)}
     numbers |= {number for number in (*_FULL, *_BROKEN) if any(os.strerror(number) in str(cause) for cause in causes)}
     if numbers.intersection(_FULL) or free_bytes(path) < FULL_BELOW_BYTES:
-        return InputError("no space left on the disk", where=str(path), mend=_MEND)
+        return InputError("no space left on the disk", where=str(path), hint=_HINT)
     if numbers.intersection(_CLOSED):
-        return InputError("cannot write here", where=str(path), got=str(error), mend="write elsewhere with --out DIR")
+        return InputError("cannot write here", where=str(path), got=str(error), hint="write elsewhere with --out DIR")
     if numbers.intersection(_BROKEN):
         return InputError("the disk fails", where=str(path), got=str(error),
-                          mend="check the disk (dmesg), or write elsewhere with --out DIR")
+                          hint="check the disk (dmesg), or write elsewhere with --out DIR")
     return None

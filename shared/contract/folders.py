@@ -74,7 +74,7 @@ class RunFolder:
             path.mkdir(parents=True)
         except OSError as error:
             raise InputError("cannot write here", where=str(self.work), got=error.strerror,
-                             mend="write elsewhere with --out DIR") from error
+                             hint="write elsewhere with --out DIR") from error
         return path
 
     def temporary_of(self, name: str, process: int) -> Path:
@@ -217,7 +217,7 @@ def _acquire(path: Path, deadline: float) -> int:
             if isinstance(error, FileNotFoundError) and tries < _MOST_TRIES:
                 continue
             raise InputError("cannot write here", where=str(path.parent), got=error.strerror,
-                             mend="write elsewhere with --out DIR") from error
+                             hint="write elsewhere with --out DIR") from error
         try:
             fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -227,7 +227,7 @@ def _acquire(path: Path, deadline: float) -> int:
                 raise
             if time.monotonic() > deadline:
                 raise InputError("another process works here", where=str(path.parent), got=f"process {owner or '?'}",
-                                 mend="wait for it or end it") from error
+                                 hint="wait for it or end it") from error
             time.sleep(0.05)
             continue
         if _is_same_file(path, file):

@@ -89,5 +89,5 @@ class Job:
 
 def _present(record: dict | None, folder: Path) -> dict:
     if record is None:
-        raise InputError("the stage's record is missing or damaged", where=str(folder), mend="run limn run again")
+        raise InputError("the stage's record is missing or damaged", where=str(folder), hint="run limn run again")
     return record

@@ -108,7 +108,7 @@ def model_inputs(stage: Stage, memory: HashMemory) -> dict[str, str]:
     paths = {name: models_folder() / name for name in stage.models}
     for path in paths.values():
         if not path.is_file():
-            raise InputError("the models are not set up", where=str(path), got="no such file", mend="run make setup")
+            raise InputError("the models are not set up", where=str(path), got="no such file", hint="run make setup")
     return {f"model {name}": memory.hash(path) for name, path in paths.items()}
 
 

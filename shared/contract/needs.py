@@ -32,7 +32,7 @@ _AMOUNT = Parameter("amount", float, 0.0, "What one unit needs.", "", 0.0, 1e9)
 
 
 @dataclass(frozen=True)
-class Scale:
+class WorkSize:
     """How large the work is: number of frames, edges of the crop and of the maps in px; 0 where unknown."""
 
     frames: float = 0.0
@@ -67,7 +67,7 @@ def parse_sizes(value: object, where: str) -> dict[str, str]:
 
 
 def scale_of(sizes: Mapping[str, str], stages: Mapping[str, Stage], parameters: Mapping[str, Mapping[str, object]],
-             where: str) -> Scale:
+             where: str) -> WorkSize:
     """The largest scale that the parameters allow; InputError where `sizes` names what does not exist."""
     found = {}
     for size, source in sizes.items():
@@ -76,10 +76,10 @@ def scale_of(sizes: Mapping[str, str], stages: Mapping[str, Stage], parameters: 
             known = [f"{s.name}.{p.name}" for s in stages.values() for p in s.parameters]
             raise unknown_name("parameter", source, known, f"{where}: sizes.{size}")
         found[size] = float(parameters[stage][name])
-    return Scale(**found)
+    return WorkSize(**found)
 
 
-def amount(needs: Mapping[str, Mapping[str, float]], kind: str, scale: Scale) -> int | None:
+def amount(needs: Mapping[str, Mapping[str, float]], kind: str, scale: WorkSize) -> int | None:
     """Megabytes or minutes, rounded up; None where pipeline.yaml does not say."""
     if kind not in needs:
         return None
@@ -87,7 +87,7 @@ def amount(needs: Mapping[str, Mapping[str, float]], kind: str, scale: Scale) ->
     return max(1, math.ceil(sum(value * terms[term] for term, value in needs[kind].items())))
 
 
-def measured_scale(run: Path, expected: Scale) -> Scale:
+def measured_scale(run: Path, expected: WorkSize) -> WorkSize:
     """The scale of the clip as sample_frames found it, or the expected one as long as it has not run.
 
     run: the folder that holds work/. Of several clips all frames, and the largest crop.
@@ -100,6 +100,6 @@ def measured_scale(run: Path, expected: Scale) -> Scale:
         if not all(0 < edge <= LARGEST_EDGE_PX for pair in edges for edge in pair):
             return expected
         areas = [width * height for width, height in edges]
-        return Scale(sum(len(content["frames"]) for content in contents), max(areas) ** 0.5, expected.map_px)
+        return WorkSize(sum(len(content["frames"]) for content in contents), max(areas) ** 0.5, expected.map_px)
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return expected

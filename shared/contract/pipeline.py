@@ -99,7 +99,7 @@ class Pipeline:
             return REPOSITORY
         if not is_trusted(own):
             raise InputError("stages of its own are code that would be run", where=str(self.path), got=str(own),
-                             mend=f"if you know them: --trust {self.path.parent}")
+                             hint=f"if you know them: --trust {self.path.parent}")
         return self.path.parent
 
     @property
@@ -159,7 +159,7 @@ def _without_files(stage: Stage, values: Mapping[str, object], where: str) -> di
     """Values of pipeline.yaml, parsed; InputError where one names a file, which only the operator may."""
     for name in (p.name for p in stage.parameters if p.file and values.get(p.name)):
         raise InputError("a file may be named on the command line only", where=f"{where}: {stage.name}.{name}",
-                         mend=f"leave it out here and add --set {stage.name}.{name}=FILE")
+                         hint=f"leave it out here and add --set {stage.name}.{name}=FILE")
     return stage.parse(values, where)
 
 
@@ -167,7 +167,7 @@ def load_pipeline(path: Path | None = None) -> Pipeline:
     """Reads pipeline.yaml (the repository's by default) and checks its structure; InputError where it is wrong."""
     path = Path(path).absolute() if path else DEFAULT_PIPELINE
     if not path.is_file():
-        raise InputError("no such file", where=str(path), mend="give the pipeline with --pipeline FILE")
+        raise InputError("no such file", where=str(path), hint="give the pipeline with --pipeline FILE")
     known = ("package", "stages", "presets", "default_preset", "sizes", "gates")
     content = check_keys(read_yaml(path), known, str(path))
     given = check_keys(content.get("stages"), Anything(), f"{path}: stages")
@@ -198,7 +198,7 @@ def _gate(value: object, where: str) -> Gate:
     given = check_keys(value, ("least", "most"), where)
     limits = {name: _LIMIT.parse(limit, f"{where}.{name}") for name, limit in given.items()}
     if not any(limit is not None for limit in limits.values()):
-        raise InputError("a gate without limits", where=where, mend="give least: or most:")
+        raise InputError("a gate without limits", where=where, hint="give least: or most:")
     return Gate(**limits)
 
 
@@ -211,10 +211,10 @@ def _step(value: object, where: str) -> Step:
     needs = given.get("needs") or []
     if not isinstance(needs, list):
         raise InputError("not a list of stages", where=f"{where}.needs", got=shown(needs))
-    booked = parse_needs(given.get("resources"), f"{where}.resources")
+    requested = parse_needs(given.get("resources"), f"{where}.resources")
     threads = _THREADS.parse(given.get("threads"), f"{where}.threads")
     parameters = check_keys(given.get("parameters"), Anything(), f"{where}.parameters")
-    return Step(tuple(map(str, needs)), threads, booked, parameters)
+    return Step(tuple(map(str, needs)), threads, requested, parameters)
 
 
 def _in_order(steps: Mapping[str, Step], path: Path) -> dict[str, Step]:
@@ -247,8 +247,8 @@ def split_settings(settings: Iterable[str], stages: Iterable[str], where: str = 
         stage, dot, key = name.strip().partition(".")
         if not equals or not dot or not key:
             raise InputError("setting not understood", where=where, got=setting, expected="stage.key=value",
-                             mend="" if dot else f"stages: {', '.join(stages)}")
+                             hint="" if dot else f"stages: {', '.join(stages)}")
         if stage not in stages:
-            raise InputError(f"unknown stage {stage!r}", where=where, mend=nearest(stage, stages))
+            raise InputError(f"unknown stage {stage!r}", where=where, hint=nearest(stage, stages))
         values.setdefault(stage, {})[key] = value.strip()
     return values

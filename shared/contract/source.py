@@ -25,7 +25,7 @@ _INSTALLED = {"site-packages", "dist-packages"}
 def read_declaration(path: Path) -> Stage:
     """The STAGE of a stage file; InputError where there is no such file or it declares nothing."""
     if not path.is_file():
-        raise InputError("no such stage", where=str(path), mend="correct 'stages' in pipeline.yaml")
+        raise InputError("no such stage", where=str(path), hint="correct 'stages' in pipeline.yaml")
     tree = ast.parse(path.read_bytes(), filename=str(path))
     assigned = {target.id: node for node in tree.body for target in _targets(node)}
     if "STAGE" not in assigned:

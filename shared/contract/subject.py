@@ -67,7 +67,7 @@ class Subject:
             if clip.name == name:
                 return clip
         if not self.clips:
-            raise InputError("this subject has one clip", where=where, got=name, mend="leave the name out")
+            raise InputError("this subject has one clip", where=where, got=name, hint="leave the name out")
         raise unknown_name("clip", name, [clip.name for clip in self.clips], where)
 
     def video_name(self) -> str:
@@ -108,13 +108,13 @@ def load_subject(folder: Path) -> Subject:
 def _load(folder: Path) -> Subject:
     path = folder / "subject.yaml"
     if not folder.is_dir():
-        raise InputError("no such folder", where=str(folder), mend=_NEW)
+        raise InputError("no such folder", where=str(folder), hint=_NEW)
     if not path.is_file():
-        raise InputError("no subject.yaml in this folder", where=str(folder), mend=_NEW)
+        raise InputError("no subject.yaml in this folder", where=str(folder), hint=_NEW)
     name = folder.resolve().name
     if not name.isprintable() or not name:
         raise InputError("the folder's name cannot be used", where=str(folder), expected="printable letters in UTF-8",
-                         mend="rename it")
+                         hint="rename it")
     check_link(path, folder)
     content = check_keys(read_yaml(path), (*_OF_A_CLIP, *_OF_ALL), str(path))
     capture = check_keys(content.get("capture"), ("moves",), f"{path}: capture")
@@ -126,7 +126,7 @@ def _load(folder: Path) -> Subject:
     for clip in clips:
         if videos.count(clip.video) > 1:
             raise InputError("two clips of one video", where=f"{path}: clips.{clip.name}.video", got=clip.video_name(),
-                             mend="give each clip a video of its own")
+                             hint="give each clip a video of its own")
     return replace(clips[0], name=name, clips=clips)
 
 
@@ -136,14 +136,14 @@ def _clips(content: dict, path: Path) -> list[tuple[str, dict]]:
     for key in ("video", "tracking", "chart"):
         if content.get(key) is not None:
             raise InputError(f"both {key} and clips", where=str(path),
-                             mend=f"move {key} to where it belongs: clips: {{NAME: {{{key}: ...}}}}")
+                             hint=f"move {key} to where it belongs: clips: {{NAME: {{{key}: ...}}}}")
     named = check_keys(content["clips"], Anything(), where)
     for name in named:
         if not isinstance(name, str) or not _CLIP_NAME.match(name):
             raise InputError("not a clip's name", where=where, got=shown(name), expected="a short name in snake_case")
     if not 2 <= len(named) <= MOST_CLIPS:
         raise InputError("number of clips not allowed", where=where, got=len(named), expected=f"2 .. {MOST_CLIPS}",
-                         mend="name one clip as video: FILE, without clips")
+                         hint="name one clip as video: FILE, without clips")
     common = {key: content[key] for key in ("camera", "colour") if content.get(key) is not None}
     return [(name, common | check_keys(own, _OF_A_CLIP, f"{where}.{name}")) for name, own in named.items()]
 
@@ -164,17 +164,17 @@ def _clip(folder: Path, name: str, content: dict, moves: str, where: str) -> Sub
 def _camera(given: dict, where: str) -> dict[str, float | None]:
     camera = {p.name: p.parse(given.get(p.name), f"{where}.{p.name}") for p in _CAMERA}
     if camera["focal_length_px"] is not None and camera["focal_length_mm"] is not None:
-        raise InputError("both focal_length_px and focal_length_mm", where=where, mend="keep one of them")
+        raise InputError("both focal_length_px and focal_length_mm", where=where, hint="keep one of them")
     if camera["focal_length_mm"] is not None and camera["sensor_width_mm"] is None:
         raise InputError("focal_length_mm without sensor_width_mm", where=where,
-                         mend="add sensor_width_mm (36 for 'full frame equivalent' lengths)")
+                         hint="add sensor_width_mm (36 for 'full frame equivalent' lengths)")
     return camera
 
 
 def _choice(value: object, known: tuple[str, ...], where: str) -> str:
     if not isinstance(value, str) or value not in known:
         raise InputError("value not known", where=where, got=shown(value),
-                         expected=" | ".join(known), mend=nearest(shown(value).strip("'\"").lower(), known))
+                         expected=" | ".join(known), hint=nearest(shown(value).strip("'\"").lower(), known))
     return str(value)
 
 
@@ -192,7 +192,7 @@ def _tracking(folder: Path, given: object, where: str) -> dict[str, object]:
     if not isinstance(hold, bool):
         raise InputError("value not known", where=f"{where}.hold_poses", got=shown(hold), expected="true | false")
     if hold and "poses" not in files:
-        raise InputError("hold_poses without poses", where=where, mend="add poses: FILE.npz, or leave hold_poses out")
+        raise InputError("hold_poses without poses", where=where, hint="add poses: FILE.npz, or leave hold_poses out")
     return {**files, "hold_poses": hold}
 
 
@@ -211,10 +211,10 @@ def _check_files(subject: Subject) -> None:
     where = str(subject.video)
     files = subject.video_files()
     if not files:
-        raise InputError("no such video", where=where, mend="correct 'video' in subject.yaml or put the file there")
+        raise InputError("no such video", where=where, hint="correct 'video' in subject.yaml or put the file there")
     if len(files) > MOST_FILES:
         raise InputError("too many images", where=where, got=len(files), expected=f"{MOST_FILES} or fewer",
-                         mend="cut out the head turn")
+                         hint="cut out the head turn")
     total = 0
     for file in files:
         check_link(file, subject.folder)
@@ -222,7 +222,7 @@ def _check_files(subject: Subject) -> None:
             size = file.stat().st_size
         total += size
         if size == 0:
-            raise InputError("the file is empty", where=str(file), mend="copy it from the camera again")
+            raise InputError("the file is empty", where=str(file), hint="copy it from the camera again")
     if total > LARGEST_BYTES:
         raise InputError("the clip is too large", where=where, got=f"{total / 1e9:.0f} GB",
-                         expected=f"{LARGEST_BYTES / 1e9:.0f} GB or less", mend="cut out the head turn")
+                         expected=f"{LARGEST_BYTES / 1e9:.0f} GB or less", hint="cut out the head turn")

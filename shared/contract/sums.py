@@ -30,7 +30,7 @@ def read_sums(folder: Path) -> dict[str, str]:
     path = folder / SUMS
     if path.is_symlink() or not path.is_file():
         raise InputError(f"no {SUMS} here", where=str(folder), expected="the export folder of a finished run",
-                         mend="results of earlier versions have none: limn run writes them anew")
+                         hint="results of earlier versions have none: limn run writes them anew")
     try:
         with open(path, encoding="utf-8") as file:
             text = file.read(LARGEST_BYTES + 1)

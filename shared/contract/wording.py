@@ -23,7 +23,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 def unknown_name(kind: str, name: object, known: Iterable[str], where: str) -> InputError:
     """The error for a name that nobody declared."""
-    return InputError(f"unknown {kind} {shown(name)}", where=where, mend=nearest(shown(name).strip("'\""), known))
+    return InputError(f"unknown {kind} {shown(name)}", where=where, hint=nearest(shown(name).strip("'\""), known))
 
 
 def check_keys(mapping: object, known: Collection[str], where: str) -> dict:

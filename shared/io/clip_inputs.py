@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shared.chart import ChartSight
+from shared.chart import ChartObservation
 from shared.color import decode_transfer
 from shared.errors import InputError
 from shared.gather import Picture, prepare_picture
@@ -16,7 +16,7 @@ from shared.io.frames import FrameSet
 from shared.io.images import read_exr
 from shared.io.meshes import load_mesh, read_obj
 from shared.mesh import Mesh
-from shared.texture_match import MeanTexture
+from shared.texture_match import ClipTexture
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,11 @@ class ClipInputs:
         """Frame f's mask [H, W] uint8, 0: background."""
         return self.frames.read_mask(int(self.place[f]))
 
-    def chart_sights(self) -> tuple[ChartSight, ...]:
+    def chart_observations(self) -> tuple[ChartObservation, ...]:
         """The colour chart in the frames where one was found."""
-        return tuple(ChartSight.from_record(record, self.frames.crop, self.frame_index) for record in self.frames.chart)
+        return tuple(
+            ChartObservation.from_record(record, self.frames.crop, self.frame_index) for record in self.frames.chart
+        )
 
 
 def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: str = "") -> ClipInputs:
@@ -75,8 +77,10 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
     three poses belong to sampled frames.
     """
     tracked_poses = load_arrays(tracked / "poses.npz")
-    lens = {"intrinsics": tracked_poses["intrinsics_crop"], "intrinsics_source": tracked_poses["intrinsics"]}
-    frames = replace(FrameSet.open(sampled), **lens)
+    frames = replace(
+        FrameSet.open(sampled), intrinsics=tracked_poses["intrinsics_crop"],
+        intrinsics_source=tracked_poses["intrinsics"]
+    )
     path = Path(mesh_path) if mesh_path else tracked / "mesh.npz"
     mesh = read_obj(path) if path.suffix == ".obj" else load_mesh(path)
     segment = load_arrays(path).get("face_segment") if path.suffix == ".npz" else None
@@ -88,9 +92,9 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
     return ClipInputs(mesh, pose, frames.intrinsics, frames.size, frames.moves, frames, place, segment, names, tracks)
 
 
-def read_mean_texture(folder: Path, mesh: Mesh) -> MeanTexture:
+def read_mean_texture(folder: Path, mesh: Mesh) -> ClipTexture:
     """What init_albedo averaged on a mesh, from its folder."""
-    return MeanTexture(mesh, read_exr(folder / "mean_texture.exr"), read_exr(folder / "weight.exr"))
+    return ClipTexture(mesh, read_exr(folder / "mean_texture.exr"), read_exr(folder / "weight.exr"))
 
 
 def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.ndarray]:

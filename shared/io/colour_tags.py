@@ -35,7 +35,7 @@ PRIMARIES = {
 HDR = {16: "pq", 18: "hlg"}
 _NO_LIGHT = {9: "logarithmic", 10: "logarithmic", 17: "SMPTE ST 428"}
 _XYZ = 10
-_MEND = "convert it to Rec.709 first, or to linear EXR with transfer: linear"
+_HINT = "convert it to Rec.709 first, or to linear EXR with transfer: linear"
 _GRID, _ROWS = 65535, 256
 
 
@@ -75,7 +75,7 @@ def conversion_of(picture: av.VideoFrame, transfer: str, where: str, profile: in
     primaries, curve = int(picture.color_primaries), int(picture.color_trc)
     if curve in _NO_LIGHT or primaries == _XYZ:
         raise InputError("the pictures' colours are tagged as what is not converted", where=where,
-                         got=_NO_LIGHT.get(curve, "CIE XYZ"), mend=_MEND)
+                         got=_NO_LIGHT.get(curve, "CIE XYZ"), hint=_HINT)
     hdr = HDR.get(curve, "")
     primaries = profile if profile != 1 and primaries == UNSPECIFIED else primaries
     if hdr and primaries == UNSPECIFIED:

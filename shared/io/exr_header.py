@@ -40,7 +40,7 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class Part:
+class ExrPart:
     """One part. data, display: windows as (x0, y0, x1, y1), x1 and y1 outside; values: its other attributes of a plain
     type by name; deep: whether a pixel holds several samples.
     """
@@ -63,7 +63,7 @@ class Part:
                    for c in self.channels)
 
 
-def read_parts(path: Path | str) -> list[Part]:
+def read_parts(path: Path | str) -> list[ExrPart]:
     """The parts of an EXR file, none of its pixels read. InputError where the headers are damaged or cut off."""
     try:
         with open(path, "rb") as file:
@@ -78,26 +78,26 @@ def read_parts(path: Path | str) -> list[Part]:
         raise InputError("truncated EXR, or damaged in its header", where=str(path)) from error
 
 
-def check_decodable(path: Path | str, most_pixels: int = MAX_PIXELS) -> Part:
+def check_decodable(path: Path | str, most_pixels: int = MAX_PIXELS) -> ExrPart:
     """The first part, after all parts are found small enough to be decoded. InputError otherwise."""
     parts, where = read_parts(path), str(path)
     for part in parts:
         if part.deep:
             raise InputError("a deep EXR", where=where, expected="one sample a pixel",
-                             mend="flatten it: oiiotool IN.exr --flatten -o OUT.exr")
+                             hint="flatten it: oiiotool IN.exr --flatten -o OUT.exr")
         check_size(*part.size, where, smallest=1, largest=most_pixels)
         if any(edge > 4096 for edge in part.values.get("tiles", (1, 1))):
             raise InputError("the tiles of the EXR are too large", where=where, got=part.values["tiles"],
-                             expected="4096 px or less each way", mend="oiiotool IN.exr --scanline -o OUT.exr")
+                             expected="4096 px or less each way", hint="oiiotool IN.exr --scanline -o OUT.exr")
     needed, most = sum(part.bytes() for part in parts), PIXEL_BYTES * most_pixels
     if needed > most:
         raise InputError("the EXR is too large once decoded", where=where, expected=f"{most >> 20} MB or less",
                          got=f"{sum(len(part.channels) for part in parts)} channels in {len(parts)} parts, "
-                             f"{needed >> 20} MB", mend=f"keep the colour only: {_KEEP_CHANNELS}")
+                             f"{needed >> 20} MB", hint=f"keep the colour only: {_KEEP_CHANNELS}")
     return parts[0]
 
 
-def _parts(data: bytes, where: str) -> list[Part]:
+def _parts(data: bytes, where: str) -> list[ExrPart]:
     version, parts, at = struct.unpack_from("<I", data, 4)[0], [], 8
     while True:
         attributes, at = _attributes(data, at)
@@ -108,7 +108,7 @@ def _parts(data: bytes, where: str) -> list[Part]:
             return parts
         if len(parts) > MOST_PARTS:
             raise InputError("too many parts in the EXR", where=where, expected=f"{MOST_PARTS} or fewer",
-                             mend=f"keep the colour only: {_KEEP_CHANNELS}")
+                             hint=f"keep the colour only: {_KEEP_CHANNELS}")
 
 
 def _attributes(data: bytes, at: int) -> tuple[dict[str, tuple[str, bytes]], int]:
@@ -131,7 +131,7 @@ def _word(data: bytes, at: int) -> tuple[str, int]:
     return data[at:end].decode("utf-8", errors="replace"), end + 1
 
 
-def _part(attributes: dict[str, tuple[str, bytes]], deep: bool, where: str) -> Part:
+def _part(attributes: dict[str, tuple[str, bytes]], deep: bool, where: str) -> ExrPart:
     values: dict[str, object] = {}
     for name, (kind, raw) in attributes.items():
         if _TYPES.get(name, kind) != kind:
@@ -147,7 +147,7 @@ def _part(attributes: dict[str, tuple[str, bytes]], deep: bool, where: str) -> P
             values[name] = raw[0]
     data, display = (_window(values[name]) for name in ("dataWindow", "displayWindow"))
     deep = deep or str(values.get("type", "")).startswith("deep")
-    return Part(_channels(attributes["channels"][1], where), data, display, values, deep)
+    return ExrPart(_channels(attributes["channels"][1], where), data, display, values, deep)
 
 
 def _window(corners: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
@@ -165,5 +165,5 @@ def _channels(raw: bytes, where: str) -> tuple[Channel, ...]:
         at += 16
         if len(found) > MOST_CHANNELS:
             raise InputError("too many channels in the EXR", where=where, expected=f"{MOST_CHANNELS} or fewer",
-                             mend=f"keep the colour only: {_KEEP_CHANNELS}")
+                             hint=f"keep the colour only: {_KEEP_CHANNELS}")
     return tuple(found)

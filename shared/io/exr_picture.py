@@ -17,7 +17,7 @@ import OpenEXR
 
 from shared.color import rec709_from_primaries
 from shared.errors import InputError
-from shared.io.exr_header import Part, check_decodable, read_parts
+from shared.io.exr_header import ExrPart, check_decodable, read_parts
 from shared.io.images import read_exr
 from shared.io.source import check_size
 
@@ -35,7 +35,7 @@ class ExrPicture:
     """planes: red, green and blue, or grey alone, each [H, W] of the data window; matrix: to Rec.709, or None."""
 
     planes: tuple[np.ndarray, ...]
-    part: Part
+    part: ExrPart
     matrix: np.ndarray | None
 
     @classmethod
@@ -98,7 +98,7 @@ class ExrPicture:
         if negative > NEGATIVE_LIMIT:
             raise InputError("the EXR holds negative light", got=f"{negative:.0%} of its values' sum",
                              expected="scene-linear values above 0",
-                             mend="take black level and grading off, or map the gamut into Rec.709")
+                             hint="take black level and grading off, or map the gamut into Rec.709")
         if negative > NEGATIVE_WARNING:
             found.append(f"negative values count as zero: {negative:.1%} of the light in the first image")
         if self.matrix is not None:
@@ -147,22 +147,22 @@ def read_rec709(path: Path | str) -> np.ndarray:
     return image if matrix is None or image.ndim == 2 else image @ matrix.T.astype(np.float32)
 
 
-def _check_attributes(part: Part, where: str) -> None:
+def _check_attributes(part: ExrPart, where: str) -> None:
     ratio = part.values.get("pixelAspectRatio", 1.0)
     if not abs(ratio - 1) < 1e-3:
         (width, height), known = part.size, 0.1 < ratio < 10
         size = f" --resize {round(width * ratio)}x{height} --attrib PixelAspectRatio 1" if known else ""
         raise InputError("the EXR's pixels are not square", where=where, got=f"pixelAspectRatio {ratio:g}",
-                         expected="1", mend=f"scale the images to square pixels: oiiotool IN.exr{size} -o OUT.exr")
+                         expected="1", hint=f"scale the images to square pixels: oiiotool IN.exr{size} -o OUT.exr")
     if "envmap" in part.values:
         raise InputError("the EXR is an environment map", where=where, expected="a picture of a camera")
     space = str(part.values.get("colorInteropID", ""))
     if space and not space.startswith("lin_") and space not in ("data", "unknown"):
         raise InputError("the EXR is not linear", where=where, got=space, expected="scene-linear values",
-                         mend="oiiotool IN.exr --tocolorspace lin_rec709_scene -o OUT.exr")
+                         hint="oiiotool IN.exr --tocolorspace lin_rec709_scene -o OUT.exr")
 
 
-def _matrix(part: Part, where: str) -> np.ndarray | None:
+def _matrix(part: ExrPart, where: str) -> np.ndarray | None:
     """[3, 3] to Rec.709; None where the primaries are Rec.709's, as they are where nothing is said."""
     given = part.values.get("chromaticities")
     if given is None:
@@ -175,7 +175,7 @@ def _matrix(part: Part, where: str) -> np.ndarray | None:
     return None if np.abs(matrix - np.eye(3)).max() < SAME_PRIMARIES else matrix
 
 
-def _names(part: Part, where: str) -> tuple[str, ...]:
+def _names(part: ExrPart, where: str) -> tuple[str, ...]:
     """The channels of the picture."""
     known = {channel.name: channel for channel in part.channels}
     names = ("R", "G", "B") if all(name in known for name in "RGB") else ()
@@ -184,7 +184,7 @@ def _names(part: Part, where: str) -> tuple[str, ...]:
     if not names:
         raise InputError("an EXR of other channels", where=where, got=", ".join(sorted(known)) or "none",
                          expected="R, G and B, or Y alone (not luminance and chroma)",
-                         mend="name the picture's own channels: oiiotool IN.exr --ch R=...,G=...,B=... -o OUT.exr")
+                         hint="name the picture's own channels: oiiotool IN.exr --ch R=...,G=...,B=... -o OUT.exr")
     if any(known[name].kind == 0 or known[name].step != (1, 1) for name in names):
         raise InputError("an EXR of other channels", where=where, got="integers, or channels of lower resolution",
                          expected="half or float, one value for each pixel")

@@ -51,7 +51,7 @@ class FrameSet:
         for name in [name for pair in names for name in pair]:
             if not _FILE.fullmatch(name):
                 raise InputError("not the name of a sampled frame", where=str(folder / "frames.json"), got=name,
-                                 mend="remove the folder and run again")
+                                 hint="remove the folder and run again")
         return cls(
             folder=folder,
             files=tuple(file for file, _ in names),

@@ -60,7 +60,7 @@ def _read(path: Path, name: str, shape: tuple[int, ...]) -> dict[str, np.ndarray
         expected = f"[n, {', '.join(map(str, shape))}] and frame_index [n]"
         raise InputError(f"{name} has another shape", where=str(path), got=list(values.shape), expected=expected)
     if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
-        raise InputError(f"{name} is not finite everywhere", where=str(path), mend="leave frames out that have none")
+        raise InputError(f"{name} is not finite everywhere", where=str(path), hint="leave frames out that have none")
     if frames.dtype.kind not in "iu":
         raise InputError("frame_index holds no whole numbers", where=str(path), got=str(frames.dtype))
     if len(frames) < LEAST_FRAMES:

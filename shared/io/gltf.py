@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from shared.errors import LimnError
 from shared.io.export_maps import integer_codes
-from shared.io.usd_capture import Capture, world_from_head_rigid, world_from_usd_camera
+from shared.io.usd_capture import UsdCapture, world_from_head_rigid, world_from_usd_camera
 from shared.io.usd_geometry import shading_normals
 from shared.mesh import Mesh, unique_pairs
 
@@ -63,7 +63,7 @@ class _Buffer:
         return len(self.accessors) - 1
 
 
-def write_glb(path: Path | str, name: str, mesh: Mesh, maps: Mapping[str, np.ndarray], capture: Capture) -> None:
+def write_glb(path: Path | str, name: str, mesh: Mesh, maps: Mapping[str, np.ndarray], capture: UsdCapture) -> None:
     """One file with all inside. maps: diffuse_albedo, specular_intensity, roughness and normal, as exported."""
     buffer = _Buffer()
     textures, material = _material(buffer, maps)
@@ -148,7 +148,7 @@ def _png(picture: np.ndarray) -> bytes:
     return encoded.tobytes()
 
 
-def _animation(buffer: _Buffer, capture: Capture) -> dict:
+def _animation(buffer: _Buffer, capture: UsdCapture) -> dict:
     """The motion of what moved, head (node 0) or camera (node 1), from 0 s at the first frame."""
     node = 1 if capture.moves == "camera" else 0
     world_from_local = world_from_usd_camera(capture) if node else world_from_head_rigid(capture)

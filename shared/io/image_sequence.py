@@ -63,7 +63,7 @@ class ImageSequenceReader:
             frame = self._opened(0, first)
         except InputError as error:
             raise InputError(f"the first image is unusable: {error.what}", where=str(first), got=error.got,
-                             expected=error.expected, mend=error.mend) from error
+                             expected=error.expected, hint=error.hint) from error
         if frame.fault:
             raise InputError(f"the first image is unusable: {frame.fault}", where=str(first))
         codes = frame.codes()
@@ -167,7 +167,7 @@ def _decoded(data: bytes, where: str) -> av.VideoFrame:
     picture = (context.decode(av.Packet(data)) or context.decode(None))[0]
     if context.sample_aspect_ratio not in (None, 0, 1):
         raise InputError("the image's pixels are not square", where=where, got=f"{context.sample_aspect_ratio}",
-                         expected="1:1", mend="scale the images to square pixels, or correct their density")
+                         expected="1:1", hint="scale the images to square pixels, or correct their density")
     return picture
 
 
@@ -175,7 +175,7 @@ def _numbered_files(pattern: Path) -> dict[int, Path]:
     """Number -> file for the one counter in the pattern's name."""
     if len(_COUNTER.findall(pattern.name)) != 1 or pattern.suffix.lower() not in KINDS.split():
         raise InputError("not a pattern for an image sequence", where=str(pattern), expected="frames/%05d.png",
-                         mend=f"one counter in the file name, and one of {KINDS}")
+                         hint=f"one counter in the file name, and one of {KINDS}")
     if not pattern.parent.is_dir():
         raise InputError("the folder of the image sequence is missing", where=str(pattern.parent))
     before, after = _COUNTER.split(pattern.name)
@@ -183,5 +183,5 @@ def _numbered_files(pattern: Path) -> dict[int, Path]:
     matches = ((name.fullmatch(file.name), file) for file in sorted(pattern.parent.iterdir()))
     files = {int(match[1]): file for match, file in matches if match and file.is_file()}
     if not files:
-        raise InputError("no image matches the pattern", where=str(pattern), mend="correct `video` in subject.yaml")
+        raise InputError("no image matches the pattern", where=str(pattern), hint="correct `video` in subject.yaml")
     return files

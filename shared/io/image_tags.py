@@ -23,7 +23,7 @@ _ORIENTATION, _PROFILE = 274, 34675
 _TYPE_BYTES = {1: 1, 3: 2, 4: 4, 7: 1}
 _SRGB_D50 = np.array([[0.4361, 0.3851, 0.1431], [0.2225, 0.7169, 0.0606], [0.0139, 0.0971, 0.7141]])
 """XYZ under D50 from linear sRGB, as its profiles hold it."""
-_MEND = "convert the images to sRGB, e.g. magick IN -profile sRGB.icc OUT"
+_HINT = "convert the images to sRGB, e.g. magick IN -profile sRGB.icc OUT"
 
 
 @dataclass(frozen=True)
@@ -47,17 +47,17 @@ class ImageTags:
             columns = np.stack([_xyz(tags[name]) for name in (b"rXYZ", b"gXYZ", b"bXYZ")], axis=1)
             middle = _curve_at_half(tags[b"gTRC"])
         except (KeyError, struct.error, ValueError, IndexError) as error:
-            raise InputError("the ICC profile is none of three lights", where=where, mend=_MEND) from error
+            raise InputError("the ICC profile is none of three lights", where=where, hint=_HINT) from error
         stated = float(decode_transfer(np.array(0.5), transfer))
         if abs(middle - stated) > SAME_CURVE:
             raise InputError(f"the ICC profile's curve is not that of transfer: {transfer}", where=where,
                              got=f"half the code is {middle:.3f} of the light", expected=f"{stated:.3f}",
-                             mend=f"correct colour.transfer, or {_MEND}")
+                             hint=f"correct colour.transfer, or {_HINT}")
         matrix = np.linalg.solve(_SRGB_D50, columns)
         known = {1: np.eye(3)} | {number: rec709_from_primaries(xy) for number, (_, xy) in PRIMARIES.items()}
         nearest = min(known, key=lambda number: np.abs(known[number] - matrix).max())
         if not np.abs(known[nearest] - matrix).max() < SAME_PRIMARIES:
-            raise InputError("the ICC profile's primaries are not known", where=where, mend=_MEND)
+            raise InputError("the ICC profile's primaries are not known", where=where, hint=_HINT)
         return nearest
 
 

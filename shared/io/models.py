@@ -14,7 +14,7 @@ from shared.io.arrays import load_arrays, read_json
 from shared.landmarks import FaceNetworks
 
 LIST_FILE = "models.json"
-_MEND = "run make setup"
+_HINT = "run make setup"
 
 
 def network_path(name: str) -> Path:
@@ -47,12 +47,12 @@ def checked_path(file_name: str) -> Path:
     path, list_path = folder / file_name, folder / LIST_FILE
     for needed in (list_path, path):
         if not needed.is_file():
-            raise InputError("the models are not set up", where=str(needed), got="no such file", mend=_MEND)
+            raise InputError("the models are not set up", where=str(needed), got="no such file", hint=_HINT)
     listed = {entry["file"]: entry["sha256"] for entry in _read_list(list_path)}
     expected, got = listed.get(file_name, "no entry in models.json"), file_sha256(path)
     if got != expected:
         raise InputError(
-            "a model file is damaged", where=str(path), got=f"SHA-256 {got[:16]}", expected=expected[:16], mend=_MEND
+            "a model file is damaged", where=str(path), got=f"SHA-256 {got[:16]}", expected=expected[:16], hint=_HINT
         )
     return path
 
@@ -61,4 +61,4 @@ def _read_list(path: Path) -> list[dict]:
     try:
         return read_json(path)["models"]
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError("the list of models is damaged", where=str(path), got=error, mend=_MEND) from error
+        raise InputError("the list of models is damaged", where=str(path), got=error, hint=_HINT) from error

@@ -45,15 +45,15 @@ class Orientation:
         lengths = math.hypot(a, b), math.hypot(c, d)
         if min(lengths) == 0 or abs(a * c + b * d) > 0.01 * lengths[0] * lengths[1]:
             raise InputError("the video's display matrix is none that a camera writes", where=where,
-                             got=f"{[int(value) for value in matrix]}", mend=_MEND_MATRIX)
+                             got=f"{[int(value) for value in matrix]}", hint=_HINT_MATRIX)
         if abs(lengths[0] / lengths[1] - 1) > 0.01:
             raise InputError("the video's display matrix stretches it: its pixels are not square", where=where,
-                             got=f"{lengths[0] / lengths[1]:.3g}:1", mend=_MEND_MATRIX)
+                             got=f"{lengths[0] / lengths[1]:.3g}:1", hint=_HINT_MATRIX)
         turned = math.degrees(math.atan2(-across[1], across[0]))
         quarters = round(turned / 90)
         if abs(turned - 90 * quarters) > LARGEST_TILT_DEG:
             raise InputError("the video's display matrix turns it by no quarter turn", where=where,
-                             got=f"{turned:.0f} degrees", expected="0, 90, 180 or 270", mend=_MEND_MATRIX)
+                             got=f"{turned:.0f} degrees", expected="0, 90, 180 or 270", hint=_HINT_MATRIX)
         return cls(quarters % 4, mirrored)
 
     @classmethod
@@ -74,4 +74,4 @@ class Orientation:
         return np.ascontiguousarray(np.rot90(codes[:, ::-1] if self.mirrored else codes, self.quarter_turns))
 
 
-_MEND_MATRIX = "write it the right way round: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4, or take the tag off"
+_HINT_MATRIX = "write it the right way round: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4, or take the tag off"

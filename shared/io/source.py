@@ -21,7 +21,7 @@ MIN_SIDE_PX = 16
 MAX_PIXELS = 7680 * 4352
 MAX_FRAMES = 20_000
 DEFAULT_FPS = 25.0
-MEND_CODEC = "re-encode it: ffmpeg -i IN -pix_fmt yuv420p -c:v libx264 -crf 12 OUT.mp4"
+HINT_CODEC = "re-encode it: ffmpeg -i IN -pix_fmt yuv420p -c:v libx264 -crf 12 OUT.mp4"
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class DecodedFrame(SourceFrame):
             codes = rgb_codes(self.reformatter, self.picture, stored_size)
         except (av.error.FFmpegError, ValueError) as error:
             raise InputError("pixels in a format that cannot be converted", where=f"frame {self.index}",
-                             got=self.picture.format.name, mend=MEND_CODEC) from error
+                             got=self.picture.format.name, hint=HINT_CODEC) from error
         return self.orientation.apply(codes if self.conversion is None else self.conversion.apply(codes))
 
 
@@ -99,17 +99,17 @@ def check_size(width: int, height: int, where: str, smallest: int = MIN_SIDE_PX,
     """
     largest = largest or MAX_PIXELS
     if min(width, height) < 1:
-        raise InputError("the picture's size cannot be read", where=where, mend="copy the file again")
+        raise InputError("the picture's size cannot be read", where=where, hint="copy the file again")
     if min(width, height) < smallest:
         raise InputError(
             "the picture is too small", where=where, got=f"{width} x {height} px",
-            expected=f"{smallest} px or more each way", mend="use the original file",
+            expected=f"{smallest} px or more each way", hint="use the original file",
         )
     if width * height > largest:
         raise InputError(
             "the picture is too large", where=where, got=f"{width} x {height} px",
             expected=f"{largest // 1_000_000} million pixels or fewer" + " (8K video)" * (largest == MAX_PIXELS),
-            mend="scale the clip down" if largest == MAX_PIXELS else "scale it down",
+            hint="scale the clip down" if largest == MAX_PIXELS else "scale it down",
         )
 
 
@@ -118,5 +118,5 @@ def check_length(frame_count: int, where: str) -> None:
     if frame_count > MAX_FRAMES:
         raise InputError(
             "the clip is too long", where=where, got=f"{frame_count} frames or more",
-            expected=f"{MAX_FRAMES} frames or fewer", mend="cut out the head turn (5 to 60 seconds)",
+            expected=f"{MAX_FRAMES} frames or fewer", hint="cut out the head turn (5 to 60 seconds)",
         )

@@ -29,8 +29,8 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from shared.errors import LimnError
 from shared.io.usd_capture import (
-    Capture,
     Plate,
+    UsdCapture,
     animate,
     define_camera,
     define_dome_light,
@@ -38,7 +38,7 @@ from shared.io.usd_capture import (
     world_from_head_rigid,
 )
 from shared.io.usd_geometry import define_mesh
-from shared.io.usd_material import Texture, define_material
+from shared.io.usd_material import TextureFile, define_material
 from shared.mesh import Mesh
 
 METERS_PER_UNIT = 0.001
@@ -56,9 +56,9 @@ class HeadAsset:
 
     name: str
     mesh: Mesh
-    maps: Mapping[str, Texture]
-    envmap: Texture
-    capture: Capture
+    maps: Mapping[str, TextureFile]
+    envmap: TextureFile
+    capture: UsdCapture
     plate: Plate | None = None
     version: str = "1"
     metadata: Mapping[str, object] = field(default_factory=dict)
@@ -202,7 +202,7 @@ def _define_capture(stage: Usd.Stage, root: Usd.Prim, asset: HeadAsset) -> None:
         animate(head, world_from_head_rigid(capture), capture.frame_index)
 
 
-def _camera_metadata(capture: Capture) -> dict:
+def _camera_metadata(capture: UsdCapture) -> dict:
     k = capture.intrinsics
     return {
         "resolution": Gf.Vec2i(int(capture.width), int(capture.height)),

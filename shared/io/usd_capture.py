@@ -17,7 +17,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from shared.geometry import WORLD_FROM_CAMERA, invert_rigid
 from shared.io.usd_geometry import define_card
-from shared.io.usd_material import Texture, define_plate_material
+from shared.io.usd_material import TextureFile, define_plate_material
 
 DEFAULT_FILM_WIDTH_MM = 36.0
 """Film back assumed where only the focal length in pixels is known; the picture is the same for any."""
@@ -25,7 +25,7 @@ _TENTHS = 10.0
 
 
 @dataclass(frozen=True)
-class Capture:
+class UsdCapture:
     """What was filmed: camera_from_head [F, 4, 4] mm, frame_index [F], intrinsics [3, 3] px of a width x
     height frame.
 
@@ -53,7 +53,7 @@ class Plate:
     rectangle: tuple[float, float, float, float]
 
 
-def define_camera(stage: Usd.Stage, path: str, capture: Capture) -> UsdGeom.Camera:
+def define_camera(stage: Usd.Stage, path: str, capture: UsdCapture) -> UsdGeom.Camera:
     """The camera with the clip's lens and film back; animated when it was the camera that moved."""
     camera = UsdGeom.Camera.Define(stage, path)
     focal_x, focal_y = capture.intrinsics[0, 0], capture.intrinsics[1, 1]
@@ -81,7 +81,7 @@ def define_camera(stage: Usd.Stage, path: str, capture: Capture) -> UsdGeom.Came
     return camera
 
 
-def world_from_usd_camera(capture: Capture) -> np.ndarray:
+def world_from_usd_camera(capture: UsdCapture) -> np.ndarray:
     """[F, 4, 4]: from the axes of a USD camera (y up, looking along -z) to the world in which the light
     stands."""
     turn = np.diag([*np.diag(WORLD_FROM_CAMERA), 1.0])
@@ -90,7 +90,7 @@ def world_from_usd_camera(capture: Capture) -> np.ndarray:
     return np.broadcast_to(np.eye(4), capture.camera_from_head.shape).copy()
 
 
-def world_from_head_rigid(capture: Capture) -> np.ndarray:
+def world_from_head_rigid(capture: UsdCapture) -> np.ndarray:
     """[F, 4, 4]: the head's motion in the world in which the light stands still."""
     turn = np.diag([*np.diag(WORLD_FROM_CAMERA), 1.0])
     if capture.moves == "camera":
@@ -119,7 +119,7 @@ def animate(prim: UsdGeom.Xformable, world_from_local: np.ndarray, time_codes: n
         last = rotation
 
 
-def define_dome_light(stage: Usd.Stage, path: str, envmap: Texture, capture: Capture) -> UsdLux.DomeLight:
+def define_dome_light(stage: Usd.Stage, path: str, envmap: TextureFile, capture: UsdCapture) -> UsdLux.DomeLight:
     """The recovered light: a dome with the lat-long map, intensity 1, at rest unless the camera carried it."""
     light = UsdLux.DomeLight.Define(stage, path)
     light.CreateIntensityAttr(1.0)
@@ -131,7 +131,7 @@ def define_dome_light(stage: Usd.Stage, path: str, envmap: Texture, capture: Cap
     return light
 
 
-def define_plate(stage: Usd.Stage, path: str, capture: Capture, plate: Plate) -> UsdGeom.Xform:
+def define_plate(stage: Usd.Stage, path: str, capture: UsdCapture, plate: Plate) -> UsdGeom.Xform:
     """The clip on a card behind the head, as far away as twice the head, filling the camera's view of its rectangle.
 
     Purpose guide: a viewer shows it when asked to display guides; renders, bounds and lighting leave it out.

@@ -52,7 +52,7 @@ NORMAL_SCALE, NORMAL_BIAS = Gf.Vec4f(2.0, 2.0, 2.0, 1.0), Gf.Vec4f(-1.0, -1.0, -
 
 
 @dataclass(frozen=True)
-class Texture:
+class TextureFile:
     """A map's file (its path relative to the layer) and colour space: "data" or a name such as lin_rec709_scene."""
 
     path: str
@@ -75,7 +75,7 @@ def modulated_ior(specular_intensity: np.ndarray) -> np.ndarray:
     return ((1.0 + root) / (1.0 - root)).astype(np.float32)
 
 
-def define_material(stage: Usd.Stage, path: str, maps: Mapping[str, Texture]) -> UsdShade.Material:
+def define_material(stage: Usd.Stage, path: str, maps: Mapping[str, TextureFile]) -> UsdShade.Material:
     """Defines the material from maps {name of SHADER_INPUTS: texture}; absent ones leave the input's default."""
     material = UsdShade.Material.Define(stage, path)
     _preview_surface(stage, material, maps)
@@ -108,7 +108,7 @@ def define_plate_material(stage: Usd.Stage, path: str, files: Mapping[int, str])
     return material
 
 
-def _preview_surface(stage: Usd.Stage, material: UsdShade.Material, maps: Mapping[str, Texture]) -> None:
+def _preview_surface(stage: Usd.Stage, material: UsdShade.Material, maps: Mapping[str, TextureFile]) -> None:
     surface = _shader(stage, material, "preview_surface", "UsdPreviewSurface")
     surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
     surface.CreateInput("useSpecularWorkflow", Sdf.ValueTypeNames.Int).Set(0)
@@ -136,7 +136,7 @@ def _preview_surface(stage: Usd.Stage, material: UsdShade.Material, maps: Mappin
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
 
 
-def _open_pbr(stage: Usd.Stage, material: UsdShade.Material, maps: Mapping[str, Texture]) -> None:
+def _open_pbr(stage: Usd.Stage, material: UsdShade.Material, maps: Mapping[str, TextureFile]) -> None:
     surface = _shader(stage, material, "openpbr_surface", "ND_open_pbr_surface_surfaceshader")
     surface.CreateInput("specular_ior", Sdf.ValueTypeNames.Float).Set(IOR)
     surface.CreateInput("base_diffuse_roughness", Sdf.ValueTypeNames.Float).Set(0.0)
@@ -169,7 +169,7 @@ def _shader(stage: Usd.Stage, material: UsdShade.Material, name: str, shader_id:
     return shader
 
 
-def _file_input(shader: UsdShade.Shader, texture: Texture) -> None:
+def _file_input(shader: UsdShade.Shader, texture: TextureFile) -> None:
     attribute = shader.CreateInput("file", Sdf.ValueTypeNames.Asset)
     attribute.Set(Sdf.AssetPath(texture.path))
     attribute.GetAttr().SetColorSpace(texture.colour_space)

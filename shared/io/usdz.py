@@ -25,7 +25,7 @@ from shared.errors import LimnError
 from shared.io.export_maps import MAPS, WORKING_SPACE, integer_codes
 from shared.io.images import write_exr, write_png
 from shared.io.usd import HeadAsset, write_single_layer
-from shared.io.usd_material import SHADER_INPUTS, SRGB, Texture
+from shared.io.usd_material import SHADER_INPUTS, SRGB, TextureFile
 
 PNG_MAPS = ("diffuse_albedo", "roughness", "normal")
 _ALIGNMENT = 64
@@ -45,12 +45,12 @@ def write_head_usdz(path: Path | str, asset: HeadAsset, maps: Mapping[str, np.nd
         for name in SHADER_INPUTS:
             is_colour = MAPS[name][0] == "colour"
             if name in PNG_MAPS:
-                textures[name] = Texture(f"./maps/{name}.png", SRGB if is_colour else "data")
+                textures[name] = TextureFile(f"./maps/{name}.png", SRGB if is_colour else "data")
                 write_png(folder / textures[name].path, integer_codes(name, maps[name], 8))
             else:
-                textures[name] = Texture(f"./maps/{name}.exr")
+                textures[name] = TextureFile(f"./maps/{name}.exr")
                 write_exr(folder / textures[name].path, maps[name], colour_space="data", half=True)
-        light = Texture("./envmap.exr", WORKING_SPACE)
+        light = TextureFile("./envmap.exr", WORKING_SPACE)
         write_exr(folder / light.path, envmap, colour_space=WORKING_SPACE, half=True, latlong=True)
         layer = folder / "head.usdc"
         write_single_layer(layer, replace(asset, maps=textures, envmap=light, plate=None))

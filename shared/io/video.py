@@ -36,7 +36,7 @@ MAX_STALL_CPU_S, MAX_READ_CPU_S = 60.0, 7200.0
 """Processor seconds for one frame and for reading the clip once. Not wall seconds: a busy machine is no fault."""
 _TRANSFER_TAGS = {1: "bt709", 4: "gamma22", 6: "bt601", 8: "linear", 13: "srgb", 14: "bt2020", 15: "bt2020",
                   16: "pq", 18: "hlg"}
-_MEND_DAMAGED = "copy the file again from the camera, or re-encode it: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4"
+_HINT_DAMAGED = "copy the file again from the camera, or re-encode it: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4"
 _PLAIN_NUMBER = re.compile(r"[0-9]{1,4}(\.[0-9]{1,9})?")
 _FOCAL_KEYS = ("com.apple.quicktime.camera.focal_length.35mm_equivalent",)
 
@@ -66,7 +66,7 @@ class VideoReader:
             check_size(stream.codec_context.width, stream.codec_context.height, str(self.path))
             first = next(_pictures(container, stream), None)
             if first is None:
-                raise InputError("no frame of the video can be decoded", where=str(self.path), mend=_MEND_DAMAGED)
+                raise InputError("no frame of the video can be decoded", where=str(self.path), hint=_HINT_DAMAGED)
             self._orientation = Orientation.of_video(first, str(self.path))
             self._conversion = conversion_of(first, transfer, str(self.path))
             self._stored_size = first.width, first.height
@@ -122,7 +122,7 @@ class VideoReader:
             stated = f"{self._duration_s:.1f} s" if short else f"{self.info.frame_count} frames"
             raise InputError(
                 "the video is cut off or damaged", where=str(self.path), got=f"{count} frames, {max(last_s, 0):.1f} s",
-                expected=f"{stated} as its header states", mend=_MEND_DAMAGED,
+                expected=f"{stated} as its header states", hint=_HINT_DAMAGED,
             )
 
     def _info(self, container: av.container.InputContainer, stream: av.VideoStream, first: av.VideoFrame) -> VideoInfo:
@@ -145,11 +145,11 @@ class VideoReader:
 
 def _check_file(path: Path) -> None:
     if path.is_dir():
-        raise InputError("a folder is not a video", where=str(path), mend="for image files give frames/%05d.png")
+        raise InputError("a folder is not a video", where=str(path), hint="for image files give frames/%05d.png")
     if not path.is_file():
-        raise InputError("the video is missing", where=str(path), mend="correct `video` in subject.yaml")
+        raise InputError("the video is missing", where=str(path), hint="correct `video` in subject.yaml")
     if path.stat().st_size == 0:
-        raise InputError("the video is empty", where=str(path), got="0 bytes", mend="copy the file again")
+        raise InputError("the video is empty", where=str(path), got="0 bytes", hint="copy the file again")
     if not os.access(path, os.R_OK):
         raise InputError("the video cannot be opened", where=str(path), got="permission denied")
 
@@ -161,7 +161,7 @@ def _opened(path: Path) -> av.container.InputContainer:
     except (av.error.FFmpegError, OSError) as error:
         raise InputError(
             "not a video that can be read (wrong kind of file, or cut off)", where=str(path),
-            got=error.strerror or error, expected="mp4, mov, mkv, webm, avi or gif", mend=_MEND_DAMAGED,
+            got=error.strerror or error, expected="mp4, mov, mkv, webm, avi or gif", hint=_HINT_DAMAGED,
         ) from error
 
 
@@ -175,7 +175,7 @@ def _video_stream(container: av.container.InputContainer, path: Path) -> av.Vide
         stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
         return stream
     kinds = ", ".join(stream.type for stream in container.streams) or "nothing"
-    raise InputError("no video stream in the file", where=str(path), got=kinds, mend="point `video` at the clip itself")
+    raise InputError("no video stream in the file", where=str(path), got=kinds, hint="point `video` at the clip itself")
 
 
 def _moving_pictures(container: av.container.InputContainer) -> list[av.VideoStream]:
@@ -205,7 +205,7 @@ def _pictures(container: av.container.InputContainer, stream: av.VideoStream) ->
         spent, since_picture = spent + seconds, 0.0 if pictures else since_picture + seconds
         if max(seconds, since_picture) > MAX_STALL_CPU_S or spent > MAX_READ_CPU_S:
             raise InputError("decoding takes too long", where=container.name.removeprefix("file:"),
-                             got=f"{spent:.0f} processor seconds", mend="cut out the head turn, or scale the clip down")
+                             got=f"{spent:.0f} processor seconds", hint="cut out the head turn, or scale the clip down")
         yield from pictures
 
 
@@ -247,7 +247,7 @@ def _warnings(container: av.container.InputContainer, stream: av.VideoStream, fi
     ratio = stream.sample_aspect_ratio
     if ratio and ratio not in (0, 1):
         raise InputError("the video's pixels are not square", where=str(path), got=f"{ratio}", expected="1:1",
-                         mend="ffmpeg -i IN -vf scale=iw*sar:ih,setsar=1 -c:v libx264 -crf 12 OUT.mp4")
+                         hint="ffmpeg -i IN -vf scale=iw*sar:ih,setsar=1 -c:v libx264 -crf 12 OUT.mp4")
     if (count := len(_moving_pictures(container))) > 1:
         yield f"the file holds {count} videos: the largest, {first.width} x {first.height} px, is taken"
     if first.interlaced_frame:

@@ -45,7 +45,7 @@ _ADVICE = (
      "guess."),
     (r"held out fit worse",
      "Look at Motion and at the error maps for frames that stand out; film with a still light, or leave such frames "
-     "out by a higher sample_frames.blurred_below."),
+     "out by a higher sample_frames.min_sharpness."),
     (r"explains the clip poorly",
      "Look at the error maps: large even areas mean that the light changed or moved along, edges that the shape is "
      "off. Film again if the face itself is red or blue."),
@@ -65,7 +65,7 @@ _ADVICE = (
     (r"view of the head|turn|rotat|yaw|parallax",
      "Film a turn of at least 30 degrees to each side; depth and highlights come from it."),
     (r"px high|resolution|pixels wide|px wide", "Fill more of the frame with the head: 600 pixels or more are good."),
-    (r"few frames|usable frames", "Film for 5 to 20 seconds; sample_frames.blurred_below=0 keeps blurred frames."),
+    (r"few frames|usable frames", "Film for 5 to 20 seconds; sample_frames.min_sharpness=0 keeps blurred frames."),
     (r"do not fit|left out", "See the list of frames left out: the reasons say whether to film more slowly, or without "
      "hands and hair before the face."),
     (r"duplicat|dropped|cut", "Give the untouched camera file, without edits or changes of frame rate."),

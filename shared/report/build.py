@@ -12,7 +12,7 @@ from shared.io.export_maps import SOLVED_MAPS
 from shared.io.frames import FrameSet
 from shared.io.images import read_png
 from shared.mesh import Mesh
-from shared.report.content import ClipContent, Cost, ReportContent
+from shared.report.content import ClipContent, ReportContent, StageCost
 from shared.report.gather import chosen_frames, compared_frames, excluded_frames, motion
 from shared.report.page import report_html
 from shared.report.sections import number
@@ -36,7 +36,7 @@ class ClipResult:
 
 
 @dataclass(frozen=True)
-class Result:
+class ReportInputs:
     """What the export holds in memory while it writes: the report's raw material.
 
     folders {stage: folder} of the stages before it; record: the content of run.json; files: (name, text) pairs; views:
@@ -58,7 +58,7 @@ class Result:
     methods: tuple[Sequence[str], Sequence[str]] = ((), ())
 
 
-def result_report(result: Result, frame_count: int) -> str:
+def result_report(result: ReportInputs, frame_count: int) -> str:
     """The page of one result, comparing at most frame_count frames."""
     frames, poses, solve, record = result.frames, result.poses, result.solve, result.record
     tracked, solved = result.folders["track_landmarks"], result.folders["inverse_render"]
@@ -86,7 +86,7 @@ def result_report(result: Result, frame_count: int) -> str:
         chart=read_png(chart) if chart.is_file() else None,
         excluded=excluded,
         model={**solve.get("model", {}), "albedo_scale": solve.get("albedo_scale")},
-        ladder=record.get("ladder", ()),
+        selection=record.get("ladder", ()),
         residuals=solve.get("residuals", {}),
         iterations=solve.get("iterations", []),
         costs=[_cost(name, values) for name, values in record["stages"].items()],
@@ -138,8 +138,8 @@ def _numbers(angles: np.ndarray, excluded: int, record: Mapping) -> list[tuple[s
     return [*rows, ("seconds, all stages", f"{total:.0f}"), ("warnings", str(len(record["warnings"])))]
 
 
-def _cost(stage: str, values: Mapping) -> Cost:
-    return Cost(stage, values.get("wall_s"), values.get("cpu_s"), values.get("peak_memory_mb"))
+def _cost(stage: str, values: Mapping) -> StageCost:
+    return StageCost(stage, values.get("wall_s"), values.get("cpu_s"), values.get("peak_memory_mb"))
 
 
 def _parameters(record: Mapping) -> list[tuple[str, str, object]]:

@@ -27,7 +27,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Cost:
+class StageCost:
     """What a stage took; None where that is not known."""
 
     stage: str
@@ -56,7 +56,7 @@ class ReportContent:
 
     facts, numbers, files: (label, value) pairs. maps {name: [S, S] or [S, S, 3]}, envmap [H, W, 3] linear.
     angles_deg [F, 3] yaw, pitch, roll and position_mm [F, 3] at frame_index [F]. excluded: (frame, stage, reason).
-    views: None when they were not wished. ladder: the models tried, one dictionary each, in order. residuals: nested
+    views: None when they were not wished. selection: the models tried, one dictionary each, in order. residuals: nested
     dictionaries of numbers. iterations: one dictionary of numbers each. warnings: (stage, text). parameters: (stage,
     name, value). clips: all but the first, where there are several. methods: paragraphs and references.
     """
@@ -76,11 +76,11 @@ class ReportContent:
     shape: np.ndarray | None = None
     chart: np.ndarray | None = None
     excluded: Sequence[tuple[int, str, str]] = ()
-    ladder: Sequence[Mapping[str, object]] = ()
+    selection: Sequence[Mapping[str, object]] = ()
     model: Mapping[str, object] = field(default_factory=dict)
     residuals: Mapping[str, object] = field(default_factory=dict)
     iterations: Sequence[Mapping[str, float]] = ()
-    costs: Sequence[Cost] = ()
+    costs: Sequence[StageCost] = ()
     warnings: Sequence[tuple[str, str]] = ()
     parameters: Sequence[tuple[str, str, object]] = ()
     files: Sequence[tuple[str, str]] = ()

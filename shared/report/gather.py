@@ -16,7 +16,7 @@ from shared.io.frames import FrameSet
 from shared.io.images import read_exr
 from shared.report.content import Frame
 
-LADDER_SECONDS = "ladder_seconds.json"
+SELECTION_SECONDS = "ladder_seconds.json"
 RESULT_FILES = {"sample_frames": "frames.json", "track_landmarks": "tracking.json", "inverse_render": "solve.json"}
 
 
@@ -27,11 +27,12 @@ def stage_record(manifest: Mapping, provenance: Mapping) -> dict:
     return {"version": manifest["version"], "parameters": manifest["parameters"], "warnings": warnings, **costs}
 
 
-def ladder_record(folder: Path, solve: Mapping) -> list[dict]:
-    """The rungs of inverse_render's ladder with the seconds that each took; empty where none was climbed."""
-    rungs, seconds = solve.get("ladder", ()), folder / LADDER_SECONDS
-    took = read_json(seconds) if seconds.is_file() else [None] * len(rungs)
-    return [{**rung, "seconds": value} for rung, value in zip(rungs, took, strict=True)]
+def selection_record(folder: Path, solve: Mapping) -> list[dict]:
+    """The candidates of inverse_render's model selection with the seconds that each took; empty where there was
+    none."""
+    candidates, seconds = solve.get("ladder", ()), folder / SELECTION_SECONDS
+    took = read_json(seconds) if seconds.is_file() else [None] * len(candidates)
+    return [{**candidate, "seconds": value} for candidate, value in zip(candidates, took, strict=True)]
 
 
 def own_record(version: int, parameters: Mapping, wall_s: float) -> dict:

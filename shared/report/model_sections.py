@@ -1,4 +1,4 @@
-"""Sections of the report on what was solved: the ladder of models, residuals, the model that was chosen."""
+"""Sections of the report on what was solved: the models that were tried, residuals, the model that was chosen."""
 
 from __future__ import annotations
 
@@ -13,56 +13,56 @@ from shared.report.content import ReportContent
 from shared.report.sections import flat, number, table
 
 
-def ladder_section(content: ReportContent) -> str:
+def selection_section(content: ReportContent) -> str:
     """The models that were tried, in order, each with its error on held-out frames."""
-    parts = [climbed_table(content.ladder)] if content.ladder else []
-    rungs = solved_rungs(content.iterations, content.residuals, content.model)
-    if not rungs and not parts:
+    parts = [selection_table(content.selection)] if content.selection else []
+    candidates = solved_models(content.iterations, content.residuals, content.model)
+    if not candidates and not parts:
         return "<p>Nothing was recorded.</p>"
-    if rungs:
-        columns = list(dict.fromkeys(key for rung in rungs for key in rung))
-        rows = [[number(rung.get(column)) for column in columns] for rung in rungs]
+    if candidates:
+        columns = list(dict.fromkeys(key for candidate in candidates for key in candidate))
+        rows = [[number(candidate.get(column)) for column in columns] for candidate in candidates]
         numeric = [k for k, column in enumerate(columns)
-                   if all(isinstance(rung.get(column), (int, float, type(None))) for rung in rungs)]
+                   if all(isinstance(candidate.get(column), (int, float, type(None))) for candidate in candidates)]
         parts.append(table([column.replace("_", " ") for column in columns], rows, numbers=numeric))
     parts.append(f"<h3>Chosen</h3>{table(('part', 'choice'), [(k, number(v)) for k, v in flat(content.model)])}")
     return "".join(parts)
 
 
-def climbed_table(ladder: Sequence[Mapping]) -> str:
-    """The ladder of models, rung by rung."""
+def selection_table(selection: Sequence[Mapping]) -> str:
+    """The models that were tried, candidate by candidate."""
     head = ("part", "rung", "held-out error", "fell by", "standard error", "climbed", "seconds")
     keys = ("part", "rung", "held_out", "fall", "standard_error", "climbed", "seconds")
     errors = ("held_out", "fall", "standard_error")
-    rows = [[f"{rung[key]:.6f}" if key in errors and rung[key] is not None else number(rung[key]).replace("_", " ")
-             for key in keys] for rung in ladder]
-    note = ('<p class="note">The ladder, climbed on few points and frames: a rung stays where the error on frames that '
-            "were held out falls by more than its standard error. What it led to was then solved in full:</p>")
+    rows = [[f"{row[key]:.6f}" if key in errors and row[key] is not None else number(row[key]).replace("_", " ")
+             for key in keys] for row in selection]
+    note = ('<p class="note">Tried on few points and frames: a candidate stays where the error on frames that were '
+            "held out falls by more than its standard error. The model that was chosen was then solved in full:</p>")
     return table(head, rows, numbers=(2, 3, 4, 6)) + note
 
 
-def solved_rungs(
+def solved_models(
     iterations: Sequence[Mapping], residuals: Mapping[str, object], model: Mapping[str, object]
 ) -> list[dict]:
-    """Rungs from what the solver logged: one per light model and resolution, one per width of the gloss.
+    """Models from what the solver logged: one per light model and resolution, one per width of the gloss.
 
     Errors are those of the last step of each; chosen: where model names it.
     """
-    rungs = []
+    candidates = []
     for (light, resolution), steps in groupby(iterations, key=lambda step: (step.get("light"), step.get("resolution"))):
         steps = [step for step in steps if not step.get("undone")]
         if light is None or not steps:
             continue
         name = f"light, {light} {resolution}" if resolution else f"light, {light}"
         chosen = f"6 x {resolution}^2" in str(model.get("light", "")) or model.get("light") == light
-        rungs.append({"model": name, "steps": len(steps), "fitted": steps[-1].get("fitted"),
-                      "held_out": min(step["held_out"] for step in steps), "chosen": chosen})
+        candidates.append({"model": name, "steps": len(steps), "fitted": steps[-1].get("fitted"),
+                           "held_out": min(step["held_out"] for step in steps), "chosen": chosen})
     tried = residuals.get("texture_held_out")
     for name, error in (tried.items() if isinstance(tried, Mapping) else ()):
         chosen = name == model.get("specular_variation")
-        rungs.append({"model": f"gloss over the map, {name}", "steps": None, "fitted": None, "held_out": error,
-                      "chosen": chosen})
-    return rungs
+        candidates.append({"model": f"gloss over the map, {name}", "steps": None, "fitted": None, "held_out": error,
+                           "chosen": chosen})
+    return candidates
 
 
 def residual_section(content: ReportContent, frames: Sequence[Mapping]) -> str:

@@ -4,13 +4,13 @@ Model of point v, frame f, channel c:  a[v, c] E[v, f, c] + s S[v, f, c], with E
 all diffuse bounces) and S the specular lobe sum, both linear in the light. Unknown: the light's parameters, one
 specular intensity s, one roughness, the albedo of each point.
 
-Method. Albedo is eliminated: for any light it is a weighted least-squares solution per point and channel, and only the
-residual that no albedo can explain drives the light (variable projection [Golub1973], with the approximation of the
-derivative of [Kaufman1975]). The light takes Gauss-Newton steps, each solved by conjugate gradients with products only:
-a step touches the clip some twenty times and costs about as much as rendering it that often. Specular intensity and the
-logarithm of the roughness are unknowns of the same step, eliminated likewise. Weights are robust (Cauchy, by
-reweighting) and clipped or crushed samples only push when the model violates what they say. Steps end when frames that
-were held out stop improving.
+Method. Albedo is projected out (variable projection [Golub1973], with the approximation of the derivative of
+[Kaufman1975]): for any light it is a weighted least-squares solution per point and channel, and only the residual that
+no albedo can explain drives the light. The light takes Gauss-Newton steps, each solved by conjugate gradients with
+products only: a step touches the clip some twenty times and costs about as much as rendering it that often. Specular
+intensity and the logarithm of the roughness are unknowns of the same step, projected out likewise. Weights are robust
+(Cauchy, by reweighting) and clipped or crushed samples only push when the model violates what they say. Steps end when
+frames that were held out stop improving.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from shared.lobe_tables import specular_slopes, specular_tables
-from shared.lobes import LobeTable
+from shared.lobes import SpecularTransfer
 from shared.shading import Material
 from shared.solve.capture import Capture
 from shared.solve.light import FrameLight, LightPriors
@@ -36,14 +36,14 @@ from shared.transfer import nearest_points
 MINIMUM_ALBEDO, MAXIMUM_ALBEDO = 0.003, 1.0
 ROUGHNESS_RANGE, ROUGHNESS_SPREAD = (0.1, 0.7), 0.35
 """Of skin; the spread is the standard deviation of the prior on its logarithm, about where the fit starts."""
-LARGEST_ROUGHENING = 0.08
+LARGEST_ROUGHNESS_STEP = 0.08
 """Of a step, in the logarithm: lobes are linearised, and their peak goes with the inverse fourth power."""
 ALBEDO_PULL = 25.0
 """Precision of the prior on a point's albedo: a standard deviation of 0.2."""
 
 
 @dataclass(frozen=True)
-class Settings:
+class AppearanceSettings:
     """light_model: see light_models; resolutions: cubemap edge per stage of the solve; independent: how many of the
     samples count as independent evidence against the priors; noise: absolute and relative standard deviation of a
     sample; visibility: whether parts of the head cover each other; precision: most products of a step of the light, and
@@ -79,7 +79,7 @@ class Settings:
 
 
 @dataclass
-class State:
+class AppearanceState:
     """The light's parameters [M, 3] and the model they belong to, specular intensity, roughness, albedo [P, 3],
     node_albedo [K, 3]. Of several lights all parameters and texels lie one below the other."""
 
@@ -99,11 +99,11 @@ class State:
 class AppearanceSolver(SampleErrors):
     """Fits State to a Capture, by the errors of its samples. Tensors inside are channel first: [3, P, F]."""
 
-    def __init__(self, capture: Capture, settings: Settings):
+    def __init__(self, capture: Capture, settings: AppearanceSettings):
         self.capture, self.settings = capture, settings
         frames, noise = capture.frames_of_lights, settings.noise
         super().__init__(capture.samples, capture.fitted, frames, noise, settings.independent)
-        self.table = LobeTable(capture.points.normals, capture.transfer.visibility(), capture.directions)
+        self.table = SpecularTransfer(capture.points.normals, capture.transfer.visibility(), capture.directions)
         self.node_to_point = nearest_points(capture.nodes.points, capture.points)
         self.skin_prior = None
         if settings.skin is not None and capture.skin.any():
@@ -117,14 +117,14 @@ class AppearanceSolver(SampleErrors):
 
     # ------------------------------------------------------------------ set-up
     @classmethod
-    def at(cls, capture: Capture, settings: Settings, state: State) -> AppearanceSolver:
+    def at(cls, capture: Capture, settings: AppearanceSettings, state: AppearanceState) -> AppearanceSolver:
         """At a solved state of the capture, its transfer baked: to look at what the samples say there."""
         solver = cls(capture, settings)
-        solver.take_state(replace(state))
+        solver.set_state(replace(state))
         solver.bake()
         return solver
 
-    def _start(self) -> State:
+    def _start(self) -> AppearanceState:
         """Uniform lights of the level that the priors prefer for this radiance."""
         weight = (self.trust * self._skin()).double()
         radiance = ((weight * self.colours).sum((1, 2)) / weight.sum()).numpy()
@@ -137,11 +137,16 @@ class AppearanceSolver(SampleErrors):
         log_light = np.repeat(np.log(irradiance / open_share * np.array(levels)), 6 * resolution**2, axis=0)
         points, nodes = len(self.capture.points), len(self.capture.nodes.points)
         specular = self.settings.specular_prior[0] if self.settings.specular else 0.0
-        everywhere = (np.tile(albedo, (count, 1)) for count in (points, nodes))
-        model = make_light_model("cubemap", resolution, len(self.light_frames))
-        return State(log_light, model, specular, self.settings.roughness, *everywhere)
+        return AppearanceState(
+            params=log_light,
+            light_model=make_light_model("cubemap", resolution, len(self.light_frames)),
+            specular=specular,
+            roughness=self.settings.roughness,
+            albedo=np.tile(albedo, (points, 1)),
+            node_albedo=np.tile(albedo, (nodes, 1)),
+        )
 
-    def start_from(self, state: State) -> None:
+    def start_from(self, state: AppearanceState) -> None:
         """Light, specular intensity and roughness of a state of other points; the albedo is its typical one."""
         typical, own = np.median(state.albedo, axis=0), self.state
         albedo, node_albedo = (np.tile(typical, (len(some), 1)) for some in (own.albedo, own.node_albedo))
@@ -153,9 +158,9 @@ class AppearanceSolver(SampleErrors):
     def set_light(self, stage: tuple[str, int]) -> None:
         """Goes on with a light of another model or resolution, as close to the present one as it can be."""
         model = make_light_model(*stage, len(self.light_frames))
-        self.take_state(replace(self.state, params=model.fit(self.state.light), light_model=model))
+        self.set_state(replace(self.state, params=model.fit(self.state.light), light_model=model))
 
-    def take_state(self, state: State) -> None:
+    def set_state(self, state: AppearanceState) -> None:
         """Goes on from a state of these points as it is."""
         self.state, capture = state, self.capture
         if self.prior_shares:
@@ -174,11 +179,12 @@ class AppearanceSolver(SampleErrors):
             skin=self.capture.skin[index],
         )
         part.state = replace(self.state, albedo=self.state.albedo[index])
-        part.colours, part.limits, part.trust, part.precision, part.baked = (
-            x[:, index] for x in (self.colours, self.limits, self.trust, self.precision, self.baked)
+        part.colours, part.saturation, part.trust, part.precision, part.baked = (
+            x[:, index] for x in (self.colours, self.saturation, self.trust, self.precision, self.baked)
         )
         part.direct = self.direct[index]
-        part.table = LobeTable(part.capture.points.normals, part.capture.transfer.visibility(), self.capture.directions)
+        part.table = SpecularTransfer(part.capture.points.normals, part.capture.transfer.visibility(),
+                                      self.capture.directions)
         return part
 
     def weigh(self, reliability: torch.Tensor) -> None:
@@ -257,8 +263,8 @@ class AppearanceSolver(SampleErrors):
                for frames in self.light_frames]
         return torch.log(torch.stack(own) / mean).double().numpy()
 
-    # ------------------------------------------------------------------ eliminated unknowns
-    def eliminate(self, irradiance, highlights, weight) -> torch.Tensor:
+    # ------------------------------------------------------------------ unknowns that are projected out
+    def best_albedo(self, irradiance, highlights, weight) -> torch.Tensor:
         """Albedo [3, P, 1] that fits best beside highlights [3, P, F], from the fitted frames.
 
         A weak pull to the skin's typical albedo decides where no sample says anything.
@@ -269,7 +275,7 @@ class AppearanceSolver(SampleErrors):
         albedo = (moment + ALBEDO_PULL * self.typical_albedo) / (curvature + ALBEDO_PULL)
         return albedo.clamp(MINIMUM_ALBEDO, MAXIMUM_ALBEDO)
 
-    def off_albedo(self, values, irradiance, weight) -> torch.Tensor:
+    def project_off_albedo(self, values, irradiance, weight) -> torch.Tensor:
         """values [3, P, F] minus the part along E that a change of albedo would absorb.
 
         Exactly orthogonal, without the pull on the albedo: highlights are some percent of the diffuse radiance, and
@@ -284,18 +290,18 @@ class AppearanceSolver(SampleErrors):
         median = np.median(self.state.albedo[self.capture.skin], axis=0)
         return torch.from_numpy(median.astype(np.float32))[:, None, None]
 
-    def roughen(self, change: float) -> float:
+    def update_roughness(self, change: float) -> float:
         """Changes the log roughness, within its range and at most by what lobes may be linearised over, and bakes what
         follows from it -> by how much it was changed."""
-        change, before = np.clip(change, -LARGEST_ROUGHENING, LARGEST_ROUGHENING), self.state.roughness
+        change, before = np.clip(change, -LARGEST_ROUGHNESS_STEP, LARGEST_ROUGHNESS_STEP), self.state.roughness
         self.state.roughness = float(np.clip(before * np.exp(change), *ROUGHNESS_RANGE))
         self.bake_lobes()
         return abs(float(np.log(self.state.roughness / before)))
 
     def highlights(self, irradiance, reflection, weight) -> Highlights:
-        """What the samples say about the specular intensity, per channel, with albedo eliminated."""
+        """What the samples say about the specular intensity, per channel, with albedo projected out."""
         weight = weight * self.fitted
-        pure = self.off_albedo(reflection, irradiance, weight)
+        pure = self.project_off_albedo(reflection, irradiance, weight)
         moment, curvature = (weight * pure * self.colours).sum((1, 2)), (weight * pure * reflection).sum((1, 2))
         share = (weight * self.colours).sum((1, 2)) / (weight * reflection).sum((1, 2))
         intensity = (moment / curvature.clamp_min(1e-12)).double().numpy()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.gather import Picture, Samples, SurfaceViewer, gather_samples
+from shared.gather import Picture, Samples, SurfaceViewer, sample_points_in_frames
 from shared.geometry import fibonacci_sphere, world_from_head
 from shared.raycast import RayScene
 from shared.shading import DEEP
@@ -35,7 +35,7 @@ class Sizes:
 
 
 @dataclass(frozen=True)
-class Scenery:
+class PrecomputedTransfer:
     """What does not depend on the frames: directions [J, 3], bounce nodes and their transfer, whether parts of the
     head cover each other."""
 
@@ -86,12 +86,12 @@ def frames_of_lights(light_index: np.ndarray | None, count: int) -> list[np.ndar
     return [np.nonzero(index == light)[0] for light in range(int(index.max(initial=0)) + 1)]
 
 
-def set_scenery(viewer: SurfaceViewer, sizes: Sizes, visibility: bool = True) -> Scenery:
+def precompute_transfer(viewer: SurfaceViewer, sizes: Sizes, visibility: bool = True) -> PrecomputedTransfer:
     """Directions and bounce nodes of a mesh, traced; visibility off: see trace_transfer."""
     directions = fibonacci_sphere(sizes.directions)
     nodes = bounce_nodes(viewer.mesh, sizes.nodes, viewer.layout)
     node_transfer = trace_transfer(viewer.scene, nodes.points, nodes, directions, visibility=visibility)
-    return Scenery(viewer.scene, directions, nodes, node_transfer, visibility)
+    return PrecomputedTransfer(viewer.scene, directions, nodes, node_transfer, visibility)
 
 
 def spread_frames(count: int, wanted: int, light_index: np.ndarray | None = None) -> np.ndarray:
@@ -131,7 +131,7 @@ def face_front(viewer: SurfaceViewer, camera_from_head: np.ndarray, limit: float
 
 def build_capture(
     viewer: SurfaceViewer,
-    scenery: Scenery,
+    precomputed: PrecomputedTransfer,
     pictures: Iterable[Picture],
     camera_from_head: np.ndarray,
     intrinsics: np.ndarray,
@@ -152,21 +152,21 @@ def build_capture(
     """
     front = allowed & face_front(viewer, camera_from_head, 0.2)
     index = spread_vertices(viewer.layout, count, front)
-    samples = gather_samples(viewer, index, pictures, camera_from_head, intrinsics)
+    samples = sample_points_in_frames(viewer, index, pictures, camera_from_head, intrinsics)
     # Of very few frames, chosen to cover the face, no point is seen in all.
     least = min(MINIMUM_FRAMES, -(-2 * int(fitted.sum()) // 3))
     seen = (samples.weight[:, fitted] > 0).sum(1) >= least
     points = mesh_points(viewer.mesh, index[seen])
-    transfer = scenery.trace(points, progress)
+    transfer = precomputed.trace(points, progress)
     shallow = np.nonzero(transfer.blocked < DEEP)[0]
     chosen = np.nonzero(seen)[0][shallow]
     return Capture(
         points=points.take(shallow),
         samples=samples.points(chosen),
         transfer=transfer.take(shallow),
-        nodes=scenery.nodes,
-        node_transfer=scenery.node_transfer,
-        directions=scenery.directions,
+        nodes=precomputed.nodes,
+        node_transfer=precomputed.node_transfer,
+        directions=precomputed.directions,
         world_from_head=world_from_head(camera_from_head, moves),
         fitted=fitted,
         skin=skin[index[chosen]],

@@ -7,8 +7,8 @@ sphere that the head covers returns the skin's mean radiance as the clip shows i
 Two things about the chart are not known well, so several cases are weighed against each other by how well they explain
 the corners and the patches, and the spread of the factor between them counts:
 
-- Its normal, from the grid's corners and the lens. Seen from afar, a plane and its mirror image about the line of sight
-  look alike, and a plane that faces the camera shows its tilt only to second order.
+- Its normal, from the grid's corners and the lens. Seen from afar, a plane and its mirror image about the line of
+  sight look alike, and a plane that faces the camera shows its tilt only to second order.
 - Its depth, since charts come in many sizes: some way before, beside or behind the head, which shades it differently.
 
 Reference: [Collins2014] (cv2.SOLVEPNP_IPPE).
@@ -23,7 +23,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from shared.chart import COLUMNS, CORNERS, GLARE_SIGMA, PATCHES, ChartSight, reflectances
+from shared.chart import COLUMNS, CORNERS, GLARE_SIGMA, PATCHES, ChartObservation, reflectances
 from shared.color import LUMINANCE
 from shared.envmap import cube_lookup
 from shared.geometry import WORLD_FROM_CAMERA, fibonacci_sphere, invert_rigid
@@ -53,11 +53,11 @@ LIKELY_LUMINANCE = (0.03, 0.85)
 
 
 @dataclass(frozen=True)
-class ChartView:
-    """A sight with all that does not depend on the light. cosine [D, N] of N normals with the world's directions and
-    their log weights [N]; free [11 * 24, D] float32: whether a direction is open at each depth and patch."""
+class ChartTransfer:
+    """An observation with all that does not depend on the light. cosine [D, N] of N normals with the world's directions
+    and their log weights [N]; free [11 * 24, D] float32: whether a direction is open at each depth and patch."""
 
-    sight: ChartSight
+    observation: ChartObservation
     cosine: np.ndarray
     log_weight: np.ndarray
     free: np.ndarray
@@ -73,19 +73,20 @@ class ChartView:
         direct = unit * _between_depths((self.free @ lit).reshape(-1, PATCHES, count, 3))
         blocked = unit * _between_depths(((1.0 - self.free) @ self.cosine).reshape(-1, PATCHES, count, 1))
         reference = np.maximum(reflectances(), 0.0)[:, None]
-        value = self.sight.values[:, None] - reference * blocked * skin
-        weight = (self.sight.weight / self.sight.white**2)[:, None]
-        factor, glare, variance = _line(reference * direct, value, weight, (GLARE_SIGMA * self.sight.white) ** -2.0)
+        value = self.observation.values[:, None] - reference * blocked * skin
+        weight = (self.observation.weight / self.observation.white**2)[:, None]
+        factor, glare, variance = _line(reference * direct, value, weight,
+                                        (GLARE_SIGMA * self.observation.white) ** -2.0)
         misfit = weight * (value - factor[:, None] * reference * direct - glare[:, None]) ** 2
-        error = misfit.sum((1, 3)) + ((glare / (GLARE_SIGMA * self.sight.white)) ** 2).sum(-1)
+        error = misfit.sum((1, 3)) + ((glare / (GLARE_SIGMA * self.observation.white)) ** 2).sum(-1)
         freedom = max(int((weight > 0).sum()) - 3, 1)
-        excess = max(1.0, float(error.min()) / freedom)
+        variance_inflation = max(1.0, float(error.min()) / freedom)
         expected = ((_depths() - LIKELY_DEPTH_MM) / DEPTH_SIGMA_MM)[:, None]
-        log_chance = self.log_weight - 0.5 * (expected**2 + error / (TEMPER * excess))
+        log_chance = self.log_weight - 0.5 * (expected**2 + error / (TEMPER * variance_inflation))
         chance = np.exp(log_chance - log_chance.max())
         chance = (chance / chance.sum())[..., None]
         factor = np.maximum(factor, 1e-6)
-        log, relative = np.log(factor), excess * variance / factor**2
+        log, relative = np.log(factor), variance_inflation * variance / factor**2
         mean = (chance * log).sum((0, 1))
         spread = np.einsum("dnk,dna,dnb->ab", chance, log - mean, log - mean)
         return mean, spread + np.diag((chance * relative).sum((0, 1)))
@@ -120,7 +121,7 @@ def _between_depths(values: np.ndarray) -> np.ndarray:
 class ChartStatement:
     """Views of a chart in the frames of a clip; light: which of several it stands in."""
 
-    views: tuple[ChartView, ...]
+    views: tuple[ChartTransfer, ...]
     light: int = 0
 
     def log_factor(self, light: np.ndarray, skin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -147,7 +148,7 @@ def _sphere(resolution: int):
 
 
 def state_chart(
-    sights: Sequence[ChartSight],
+    observations: Sequence[ChartObservation],
     scene: RayScene,
     camera_from_head: np.ndarray,
     intrinsics: np.ndarray,
@@ -160,22 +161,22 @@ def state_chart(
     what moves against the light, "head" or "camera"; light: which of several the chart stands in.
     """
     views, lenses = [], np.broadcast_to(intrinsics, (len(camera_from_head), 3, 3))
-    for sight in sights:
-        intrinsics = lenses[sight.frame]
-        normals, log_weight = chart_normals(sight.corners, intrinsics)
+    for observation in observations:
+        intrinsics = lenses[observation.frame]
+        normals, log_weight = chart_normals(observation.corners, intrinsics)
         chance = np.exp(log_weight - log_weight.max())
         mean = chance @ normals / chance.sum()
         if -mean[2] > LEAST_COSINE:
-            pose = camera_from_head[sight.frame]
+            pose = camera_from_head[observation.frame]
             world_from_camera = pose[:3, :3].T if moves == "camera" else WORLD_FROM_CAMERA
             directions = _sphere(1)[0]
             cosine = np.maximum(directions @ (world_from_camera @ normals.T), 0.0).astype(np.float32)
-            points = _patch_places(sight.corners, mean, intrinsics, pose[2, 3])
+            points = _patch_places(observation.corners, mean, intrinsics, pose[2, 3])
             free = _open_directions(points, scene, pose, directions @ world_from_camera)
-            views.append(ChartView(sight, cosine, log_weight, free))
+            views.append(ChartTransfer(observation, cosine, log_weight, free))
     if views:
         return ChartStatement(tuple(views), light), ""
-    return None, "the colour chart is turned away from the camera: not used" if sights else ""
+    return None, "the colour chart is turned away from the camera: not used" if observations else ""
 
 
 def _patch_places(corners: np.ndarray, normal: np.ndarray, intrinsics: np.ndarray, head_depth: float) -> np.ndarray:
@@ -230,18 +231,19 @@ def describe_scale(chart: ChartStatement | None, skin: np.ndarray) -> dict:
     }
     if chart is None:
         return described
-    sights = [view.sight for view in chart.views]
-    white, sigma = (np.median([getattr(sight, name) for sight in sights], axis=0) for name in ("white", "log_sigma"))
+    observations = [view.observation for view in chart.views]
+    white, sigma = (np.median([getattr(observation, name) for observation in observations],
+                              axis=0) for name in ("white", "log_sigma"))
     factor = white / np.exp(most_likely_irradiance(np.log(skin * white)))
     return described | {"chart": {
-        "frames": [sight.frame_index for sight in sights],
+        "frames": [observation.frame_index for observation in observations],
         "irradiance_over_pi": np.round(white, 4).tolist(),
         "log_sigma": np.round(sigma, 4).tolist(),
         "priors_alone_factor": np.round(factor, 4).tolist(),
     }}
 
 
-def doubt_scale(chart: ChartStatement | None, skin: np.ndarray) -> list[str]:
+def scale_warnings(chart: ChartStatement | None, skin: np.ndarray) -> list[str]:
     """A warning where the skin's albedo [3] under a chart's scale is no skin's."""
     luminance = float(skin @ LUMINANCE)
     if chart is None or LIKELY_LUMINANCE[0] < luminance < LIKELY_LUMINANCE[1]:

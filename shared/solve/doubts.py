@@ -1,7 +1,7 @@
-"""What the fitted model shows to be wrong with the clip: signs of causes that none of its parameters can follow.
+"""What the fitted model shows to be wrong with the clip: diagnostics of causes that none of its parameters can follow.
 
-Each sign is a number that is small when a still light shines on a rigid head and the codes mean what they are said to
-mean:
+Each diagnostic is a number that is small when a still light shines on a rigid head and the codes mean what they are
+said to mean:
 - frame_gain, frame_tint: deviation of the logarithm by which whole frames are brighter, or redder against bluer, than
   the model: exposure or white balance drifts;
 - albedo_by_orientation: deviation of the part of the skin's log albedo that follows the surface's normals. A lamp on
@@ -52,8 +52,8 @@ def face_regions(
     return {"eyes": (cKDTree(eyes).query(positions)[0] < NEAR_EYES_MM) & ~forehead, "forehead": forehead}
 
 
-def signs_of(solver: AppearanceSolver, regions: Mapping[str, np.ndarray] | None = None) -> dict[str, float]:
-    """The signs by name of a solver at its solution, baked; regions [P] bool: see face_regions."""
+def diagnostics_of(solver: AppearanceSolver, regions: Mapping[str, np.ndarray] | None = None) -> dict[str, float]:
+    """The diagnostics by name of a solver at its solution, baked; regions [P] bool: see face_regions."""
     capture = solver.capture
     some = slice(None, None, -(-len(capture.points) // POINTS))
     part = solver.subset(some)
@@ -64,43 +64,43 @@ def signs_of(solver: AppearanceSolver, regions: Mapping[str, np.ndarray] | None 
     weight = part.trust * torch.from_numpy(part.capture.skin.astype(np.float32))[None, :, None]
     radiance = ((weight * part.colours).sum((1, 2)) / weight.sum()).double().numpy()
     skin = capture.skin
-    signs = {
+    diagnostics = {
         "frame_gain": gains.mean(1).std(),
         "frame_tint": (gains[:, 0] - gains[:, 2]).std(),
         "albedo_by_orientation": by_orientation(solver.state.albedo[skin], capture.points.normals[skin]),
         "unlikely_colour": unlikely_colour(radiance, solver.settings.white_sigma),
         **{f"covered_{name}": covered_share(misfit, region[some]) for name, region in (regions or {}).items()},
     }
-    return {name: round(float(value), 4) for name, value in signs.items()}
+    return {name: round(float(value), 4) for name, value in diagnostics.items()}
 
 
-def doubts_about(signs: dict[str, float], moves: str = "head") -> list[str]:
-    """What a person should know, from signs_of; moves: the head or the camera."""
+def diagnostic_warnings(measured: dict[str, float], moves: str = "head") -> list[str]:
+    """What a person should know, measured: see diagnostics_of; moves: the head or the camera."""
     found = []
-    if signs["frame_gain"] > WANDERING_GAIN:
-        found.append(f"the face's brightness wanders by {signs['frame_gain']:.0%} from frame to frame, more than its "
-                     "turn explains: lock the exposure and keep the light still")
-    if signs["frame_tint"] > WANDERING_TINT:
-        found.append(f"the face's colour wanders by {signs['frame_tint']:.0%} from frame to frame: lock the white "
+    if measured["frame_gain"] > WANDERING_GAIN:
+        found.append(f"the face's brightness wanders by {measured['frame_gain']:.0%} from frame to frame, more than "
+                     "its turn explains: lock the exposure and keep the light still")
+    if measured["frame_tint"] > WANDERING_TINT:
+        found.append(f"the face's colour wanders by {measured['frame_tint']:.0%} from frame to frame: lock the white "
                      "balance and keep the light still")
-    if signs["albedo_by_orientation"] > ORIENTED_ALBEDO:
-        found.append(f"the skin's albedo follows the surface's orientation by {signs['albedo_by_orientation']:.0%}: "
+    if measured["albedo_by_orientation"] > ORIENTED_ALBEDO:
+        found.append(f"the skin's albedo follows the surface's orientation by {measured['albedo_by_orientation']:.0%}: "
                      + "part of the light moves with the head, or " * (moves == "head")
                      + "the clip does not tell light from skin")
-    if signs["unlikely_colour"] > UNLIKELY_COLOUR:
-        found.append(f"skin and light together have an unlikely colour ({signs['unlikely_colour']:.1f} deviations): "
+    if measured["unlikely_colour"] > UNLIKELY_COLOUR:
+        found.append(f"skin and light together have an unlikely colour ({measured['unlikely_colour']:.1f} deviations): "
                      "coloured light, a filter, or a colour.transfer that is not the camera's")
     for name, words in (("covered_eyes", "around the eyes"), ("covered_forehead", "of the forehead")):
-        if signs.get(name, 0.0) > COVERED:
-            found.append(f"{signs[name]:.0%} of the skin {words} fits far worse than the face does: glasses, hair or "
-                         "something else in front of it, which the maps show as skin")
+        if measured.get(name, 0.0) > COVERED:
+            found.append(f"{measured[name]:.0%} of the skin {words} fits far worse than the face does: glasses, hair "
+                         "or something else in front of it, which the maps show as skin")
     return found
 
 
 def misfits(solver: AppearanceSolver, model: torch.Tensor) -> np.ndarray:
     """[P] mean absolute residual of the model [3, P, F] over the assumed noise."""
-    error, silent = solver.errors(model)
-    total = (solver.trust * (~silent) * error.sqrt()).sum((0, 2))
+    error, inactive = solver.errors(model)
+    total = (solver.trust * (~inactive) * error.sqrt()).sum((0, 2))
     return (total / (3.0 * solver.trust.sum((0, 2))).clamp_min(1e-9)).double().numpy()
 
 
@@ -113,7 +113,7 @@ def covered_share(misfit: np.ndarray, region: np.ndarray) -> float:
 
 def frame_gains(solver: AppearanceSolver, model: torch.Tensor) -> np.ndarray:
     """[F, 3] median logarithm of the samples over the model [3, P, F]; 0 where a frame shows nothing."""
-    used = (solver.limits == 0) & (solver.trust > 0) & (model > LEAST_MODEL) & (solver.colours > LEAST_MODEL)
+    used = (solver.saturation == 0) & (solver.trust > 0) & (model > LEAST_MODEL) & (solver.colours > LEAST_MODEL)
     ratio = torch.log(solver.colours.clamp_min(1e-6) / model.clamp_min(1e-6))
     ratio = torch.where(used, ratio, torch.full_like(ratio, torch.nan))
     return ratio.nanmedian(dim=1).values.nan_to_num().T.double().numpy()

@@ -272,7 +272,7 @@ def enough_observations(tracks: Tracks, points: np.ndarray) -> tuple[Tracks, np.
             "the skin could not be tracked through this clip",
             got=f"{len(points)} tracks, {reliable.sum()} frames with {LEAST_TRACKS} or more",
             expected="3 or more frames",
-            mend="film sharper, larger or slower: the face should be 200 px wide or more and free of motion blur",
+            hint="film sharper, larger or slower: the face should be 200 px wide or more and free of motion blur",
         )
     return tracks, points, reliable
 

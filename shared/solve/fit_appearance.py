@@ -8,11 +8,11 @@ from functools import partial
 
 import numpy as np
 
-from shared.solve.appearance import LARGEST_ROUGHENING, AppearanceSolver, Settings, State
+from shared.solve.appearance import LARGEST_ROUGHNESS_STEP, AppearanceSettings, AppearanceSolver, AppearanceState
 from shared.solve.capture import Capture
 from shared.solve.light_step import LightStep
 from shared.solve.light_trust import weigh_samples
-from shared.solve.local_roughness import GlossEquations, local_roughness
+from shared.solve.local_roughness import SpecularEquations, local_roughness
 
 _SHAPING_STEPS, _SHAPED = 3, 0.1
 """Without highlights at least as many steps from a uniform light, until one changes the fitted residual by less than
@@ -24,7 +24,7 @@ _WORTHWHILE, _WORTHWHILE_COARSE = 0.003, 0.03
 """A step that lowers the held-out residual by less than this fraction is the last of its resolution; the first of
 several resolutions is left earlier, since what it cannot resolve keeps its residual high."""
 
-_SETTLED_SCALE = 0.01
+_CONVERGED_SCALE = 0.01
 """A resolution goes on while a step changes the light's scale by more than this, in the logarithm: highlights say what
 it is, for the roughness of the moment, and the residual hardly feels it. Without highlights the priors alone do."""
 
@@ -40,26 +40,26 @@ model (an expression that changes, a palette of few colours) they can lead away 
 @dataclass(frozen=True)
 class Solution:
     """The last State of those that are best by held-out residual; iterations: one record per step; fitted and held_out:
-    its residuals; gloss: where roughness varies over the skin, how, and gloss_record what the held-out frames said to
-    that; trusted: whether highlights took part to the end; frame_errors [F]: each frame's mean absolute residual;
-    local_specular: where the specular intensity varies with the face's segments, how; light_trust: of several lights,
-    how much samples of each count against those of the light that the model follows best."""
+    its residuals; local_roughness_fit: where roughness varies over the skin, how, and roughness_record what the
+    held-out frames said to that; trusted: whether highlights took part to the end; frame_errors [F]: each frame's mean
+    absolute residual; local_specular: where the specular intensity varies with the face's segments, how; light_weights:
+    of several lights, how much samples of each count against those of the light that the model follows best."""
 
-    state: State
+    state: AppearanceState
     iterations: tuple[dict, ...]
     fitted: float
     held_out: float
-    gloss: GlossEquations | None = None
-    gloss_record: dict = field(default_factory=dict)
+    local_roughness_fit: SpecularEquations | None = None
+    roughness_record: dict = field(default_factory=dict)
     trusted: bool = True
     frame_errors: np.ndarray | None = None
-    local_specular: GlossEquations | None = None
-    light_trust: tuple[float, ...] = ()
+    local_specular: SpecularEquations | None = None
+    light_weights: tuple[float, ...] = ()
 
 
 def fit_appearance(
     capture: Capture,
-    settings: Settings,
+    settings: AppearanceSettings,
     report: Callable[[dict], None] = lambda record: None,
     start: Solution | None = None,
     keep_start: bool = False,
@@ -118,13 +118,15 @@ def fit_appearance(
                 if number + 1 >= shaping_steps and change < _SHAPED or number + 2 >= settings.steps:
                     shaping, enough = False, number + 1 + enough
             elif number >= enough and judged > last * (1.0 - worthwhile):
-                if not trusts or record["rescaled"] < _SETTLED_SCALE:
+                if not trusts or record["rescaled"] < _CONVERGED_SCALE:
                     break
             last, last_fitted = judged, record["fitted"]
     _, record, state, by_frame = best
-    errors = record["fitted"], record["held_out"]
-    light_trust = tuple(record.get("light_trust", ()))
-    return Solution(state, tuple(records), *errors, trusted=trusts, frame_errors=by_frame, light_trust=light_trust)
+    return Solution(
+        state, tuple(records), fitted=record["fitted"], held_out=record["held_out"], trusted=trusts,
+        frame_errors=by_frame,
+        light_weights=tuple(record.get("light_trust", ())),
+    )
 
 
 def _judged(record: dict, name: str, count: float) -> float:
@@ -140,12 +142,12 @@ def with_local_roughness(solver: AppearanceSolver, solution: Solution) -> Soluti
     """The solution that the solver, baked, stands at, with roughness that varies over the skin where that serves."""
     if not (solver.settings.specular and solver.settings.local_roughness):
         return solution
-    gloss, said = local_roughness(solver)
-    return replace(solution, gloss=gloss, gloss_record=said)
+    local_roughness_fit, said = local_roughness(solver)
+    return replace(solution, local_roughness_fit=local_roughness_fit, roughness_record=said)
 
 
 def _step(
-    solver: AppearanceSolver, settings: Settings, trusts: bool, moves: bool = True
+    solver: AppearanceSolver, settings: AppearanceSettings, trusts: bool, moves: bool = True
 ) -> tuple[dict, float, np.ndarray]:
     """One step of everything -> its record, by what factor the robust loss rose, and the error of each frame [F];
     trusts: highlights say something about the scale and their own strength; moves: the light changes, and not only its
@@ -157,13 +159,13 @@ def _step(
     step = _linearised(solver)
     before, spread = solver.loss(step.radiance)
     if moves:
-        step.take()
-    rescaled = step.settle()
+        step.update()
+    rescaled = step.resolve_scale()
     state = solver.state
     state.node_albedo = state.albedo[solver.node_to_point]
     model = solver.model(step.irradiance, step.reflection)
     rise = solver.loss(model, spread)[0] / before
-    solver.measure_misfit(model, step.weight)
+    solver.measure_reduced_chi_square(model, step.weight)
     fitted, held_out = solver.residuals(model)
     several = {}
     if len(solver.light_frames) > 1:
@@ -184,14 +186,14 @@ def _linearised(solver: AppearanceSolver) -> LightStep:
     then they would lead the scale astray."""
     step = LightStep(solver)
     for _ in range(_ROUGHNESS_STEPS):
-        if step.gloss is None or abs(step.gloss.change_of_roughness) < LARGEST_ROUGHENING:
+        if step.specular_fit is None or abs(step.specular_fit.change_of_roughness) < LARGEST_ROUGHNESS_STEP:
             break
-        roughened = solver.roughen(step.gloss.change_of_roughness)
+        roughness_step = solver.update_roughness(step.specular_fit.change_of_roughness)
         step = LightStep(solver)
-        if roughened < LARGEST_ROUGHENING:  # as far as its range goes
+        if roughness_step < LARGEST_ROUGHNESS_STEP:  # as far as its range goes
             break
     return step
 
 
-def _copy(state: State) -> State:
+def _copy(state: AppearanceState) -> AppearanceState:
     return replace(state, params=state.params.copy(), albedo=state.albedo.copy())

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shared.bundle import BundleSolution, adjust, zoomed
-from shared.bundle_problem import BundleProblem, State, Tracks
+from shared.bundle_problem import BundleProblem, BundleState, Tracks
 
 STEP = np.log(5.0) / 4.0
 GAINS = np.exp(STEP * np.arange(-4, 5))
@@ -60,7 +60,7 @@ def look_elsewhere(
         options = {"loss_scale": loss_scale, "prior_mm": PRIOR_MM}
         solved = adjust(thin, start, points, lens, max_iterations=ITERATIONS, **options)
         problem = BundleProblem(thin, points, lens, **options)
-        return problem.cost(State(solved.camera_from_points, solved.points)), solved
+        return problem.cost(BundleState(solved.camera_from_points, solved.points)), solved
 
     costs = np.array([solve(gain)[0] for gain in GAINS])
     lowest = int(costs.argmin())

@@ -1,4 +1,4 @@
-"""Specular intensity and roughness as samples and priors together have them, under some light, albedo eliminated.
+"""Specular intensity and roughness as samples and priors together have them, under some light, albedo projected out.
 
 With the roughness linearised both are linear: highlights are x0 S + x1 (s S'), with S the reflection at intensity 1 and
 S' its derivative by the logarithm of the roughness at the present roughness, s the present intensity, x0 the new one
@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from shared.solve.appearance import ROUGHNESS_SPREAD, AppearanceSolver, Settings, State
+from shared.solve.appearance import ROUGHNESS_SPREAD, AppearanceSettings, AppearanceSolver, AppearanceState
 
 
-class GlossFit:
+class SpecularFit:
     """Under irradiance and reflection [3, P, F], and slope, S', None where the roughness is not sought; weight
     [3, P, F] of the samples, evidence: see SampleErrors."""
 
@@ -29,7 +29,7 @@ class GlossFit:
         self._weight, self._evidence = weight, evidence
         shown = [reflection] if slope is None else [reflection, solver.state.specular * slope]
         mean, precision = (values[: len(shown)] for values in _prior(solver.settings, solver.state))
-        self._pure = [solver.off_albedo(one, irradiance, weight) for one in shown]
+        self._pure = [solver.project_off_albedo(one, irradiance, weight) for one in shown]
         curvature, moment = np.array([self._moments(one) for one in shown]), self._moments(solver.colours)
         self._known = evidence * curvature + np.diag(precision)
         self.best = np.linalg.solve(self._known, evidence * moment + precision * mean)
@@ -50,7 +50,7 @@ class GlossFit:
         return float(self.best[1]) if len(self.best) > 1 else 0.0
 
 
-def _prior(settings: Settings, state: State) -> tuple[np.ndarray, np.ndarray]:
+def _prior(settings: AppearanceSettings, state: AppearanceState) -> tuple[np.ndarray, np.ndarray]:
     """Mean and precision, each [2], of the specular intensity and of the change of the log roughness."""
     mean, sigma = settings.specular_prior
     back = np.log(settings.roughness / state.roughness)

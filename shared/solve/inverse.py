@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from shared.chart import ChartSight
+from shared.chart import ChartObservation
 from shared.gather import SurfaceViewer
 from shared.mesh import uniform_laplacian
 from shared.solve.appearance import AppearanceSolver
-from shared.solve.chart_scale import describe_scale, doubt_scale, state_chart
-from shared.solve.doubts import doubts_about, face_regions, signs_of
+from shared.solve.chart_scale import describe_scale, scale_warnings, state_chart
+from shared.solve.doubts import diagnostic_warnings, diagnostics_of, face_regions
 from shared.solve.fit_appearance import Solution, with_local_roughness
 from shared.solve.inverse_problem import (
     InverseInputs,
@@ -40,46 +40,49 @@ def solve_clip(
     settings: InverseSettings,
     progress: Callable,
     note: Callable,
-    sights: Sequence[ChartSight] = (),
+    observations: Sequence[ChartObservation] = (),
 ) -> InverseResult:
-    """The whole of it. progress(items, label) wraps loops, note(text) logs a line; sights: of a colour chart in view.
+    """The whole of it. progress(items, label) wraps loops, note(text) logs a line; observations: of a colour chart in
+    view.
     """
     viewer = SurfaceViewer.of(inputs.mesh)
     fitted = frames_to_fit(inputs, settings, viewer)
     if settings.reference is not None:
         return solve_by_reference(inputs, settings, settings.reference, fitted, progress, note)
     outline = {}
-    if settings.shape is not None and settings.shape.rim is not None and inputs.face_segment is not None:
-        frames = frames_of(inputs, settings, settings.shape.rim.frames, fitted)
-        inputs, outline = meet_outline(inputs, frames, settings.shape.rim, note)
+    if settings.shape is not None and settings.shape.contour is not None and inputs.face_segment is not None:
+        frames = frames_of(inputs, settings, settings.shape.contour.frames, fitted)
+        inputs, outline = meet_outline(inputs, frames, settings.shape.contour, note)
         viewer = SurfaceViewer.of(inputs.mesh)
     moves = settings.appearance.light_moves(inputs.moves)
-    light = int(inputs.light_index[sights[0].frame]) if sights else 0
-    chart, warning = state_chart(sights, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves, light)
+    light = int(inputs.light_index[observations[0].frame]) if observations else 0
+    chart, warning = state_chart(observations, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves, light)
     lit = solve_light(inputs, settings, viewer, fitted, chart, progress, note)
     inputs, settings, viewer = lit.inputs, lit.settings, lit.viewer.within_rim(surface_error(lit.inputs.tracks))
-    signs, solution = examine(lit)
-    shading = shade_vertices(inputs, settings.appearance, viewer, lit.scenery, solution, progress)
+    diagnostics, solution = examine(lit)
+    shading = shade_vertices(inputs, settings.appearance, viewer, lit.precomputed, solution, progress)
     surface = TexelSurface(inputs.mesh, settings.map_size)
     clip = Clip(inputs.picture, inputs.camera_from_head, inputs.intrinsics, fitted, inputs.light_index)
     typical = np.median(solution.state.albedo, axis=0)
-    known = specular_at(surface, solution), typical
-    more = {"light_trust": solution.light_trust, "region": scalp_of(inputs), "progress": progress}
-    texture = TexturePass(surface, viewer, shading, clip, *known, **more)
+    texture = TexturePass(
+        surface, viewer, shading, clip, specular=specular_at(surface, solution), typical_albedo=typical,
+        light_weights=solution.light_weights, region=scalp_of(inputs), progress=progress,
+    )
     widths = settings.map_size * np.array(settings.specular_widths if settings.appearance.specular else (np.inf,))
     material, texture_record = texture.run(widths)
-    gloss = solution.gloss
-    roughness = solution.state.roughness if gloss is None else gloss.roughness(inputs.mesh.vertices)
+    roughness, local = solution.state.roughness, solution.local_roughness_fit
+    roughness = roughness if local is None else local.roughness(inputs.mesh.vertices)
     turn, relief = None, {}
     if settings.normal_map:
         fine = NormalPass(surface, viewer, shading, clip, material, progress)
         turn, relief = fine.run(resolved_texels(surface, clip))
         note(f"fine normals: {relief}")
     maps = make_maps(surface, material, roughness, turn)
-    warnings = [*[warning] * bool(warning), *doubt_scale(chart, typical), *doubts_about(signs, inputs.moves)]
+    warnings = [warning] * bool(warning) + scale_warnings(chart, typical)
+    warnings += diagnostic_warnings(diagnostics, inputs.moves)
     shape_record = {**lit.shape_record, "outline": outline}
-    record = {"texture": texture_record, "shape": shape_record, "relief": relief, "signs": signs, "warnings": warnings}
-    record |= {"albedo_scale": describe_scale(chart, typical), "rungs": lit.rungs}
+    record = {"texture": texture_record, "shape": shape_record, "relief": relief, "signs": diagnostics}
+    record |= {"warnings": warnings, "albedo_scale": describe_scale(chart, typical), "rungs": lit.candidates}
     return InverseResult(solution, material, maps, shading, viewer, fitted, record)
 
 
@@ -88,7 +91,7 @@ def examine(lit: LitClip) -> tuple[dict[str, float], Solution]:
     solver, inputs = AppearanceSolver.at(lit.capture, lit.settings.appearance, lit.solution.state), lit.inputs
     positions = lit.capture.points.positions
     regions = face_regions(inputs.mesh, inputs.face_segment, inputs.segment_names, positions)
-    return signs_of(solver, regions), with_local_roughness(solver, lit.solution)
+    return diagnostics_of(solver, regions), with_local_roughness(solver, lit.solution)
 
 
 def scalp_of(inputs: InverseInputs) -> np.ndarray | None:
@@ -130,7 +133,7 @@ def summarise(inputs: InverseInputs, result: InverseResult) -> dict:
             "specular_intensity": round(state.specular, 4),
             "specular_variation": "by segment" if solution.local_specular else result.record["texture"]["chosen"],
             "roughness": round(state.roughness, 4),
-            "roughness_variation": solution.gloss_record,
+            "roughness_variation": solution.roughness_record,
             "moves": inputs.moves,
         },
         "residuals": {
@@ -139,7 +142,7 @@ def summarise(inputs: InverseInputs, result: InverseResult) -> dict:
             "texture_held_out": result.record["texture"]["held_out"],
         },
         **{key: result.record[key] for key in ("shape", "relief", "signs") if key in result.record},
-        **({"ladder": [dict(rung) for rung in result.record["rungs"]]} if result.record.get("rungs") else {}),
+        **({"ladder": [dict(candidate) for candidate in result.record["rungs"]]} if result.record.get("rungs") else {}),
         "iterations": list(solution.iterations),
         "albedo_scale": result.record["albedo_scale"],
         "seen_share_of_texels": round(float(seen.mean()), 4),

@@ -9,7 +9,7 @@ import torch
 from shared.contract.job import Parameters
 from shared.contract.wording import unknown_name
 from shared.errors import InputError
-from shared.solve.appearance import Settings
+from shared.solve.appearance import AppearanceSettings
 from shared.solve.capture import Sizes
 from shared.solve.inverse_problem import InverseSettings
 from shared.solve.ladder import PARTS
@@ -27,15 +27,15 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
     """All settings; checkpoint: the reference solver's own file, or None. InputError for what cannot go together."""
     if params.model == "auto" and params.solver == "reference":
         raise InputError("model=auto belongs to solver=transfer", where="--set inverse_render.model",
-                         mend="leave out one of the two; the reference solver takes visibility and specular as given")
-    appearance = Settings(
+                         hint="leave out one of the two; the reference solver takes visibility and specular as given")
+    appearance = AppearanceSettings(
         light_model=params.light_model,
         resolutions=tuple(n for n in (8, 16, 32) if n <= params.light_resolution) or (params.light_resolution,),
         steps=params.light_steps,
-        independent=params.evidence,
+        independent=params.independent_samples,
         priors=LightPriors(smooth=params.light_smoothness),
-        white_sigma=params.white_light,
-        skin=SkinVariation(params.skin_brightness, params.skin_colour),
+        white_sigma=params.light_colour_sigma,
+        skin=SkinVariation(params.skin_brightness_sigma, params.skin_colour_sigma),
         visibility=params.visibility,
         bounce=params.bounce,
         specular=params.specular,
@@ -44,14 +44,14 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         local_roughness=params.local_roughness,
         specular_prior=(params.specular_prior, SPECULAR_SPREAD),
     )
-    rim = {} if params.silhouette else {"rim": None}
+    contour = {} if params.silhouette else {"contour": None}
     shape = ShapeSettings(
         subdivisions=params.shape_subdivisions,
         rounds=params.shape_rounds,
         frames=params.shape_frames,
         smoothness=params.shape_smoothness,
-        sigma_mm=params.shape_spread,
-        **rim,
+        sigma_mm=params.shape_sigma,
+        **contour,
     )
     return InverseSettings(
         sizes=Sizes(params.points, params.directions, params.bounce_nodes),
@@ -63,7 +63,7 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         fit_frames=params.fit_frames,
         normal_map=params.normal_map,
         reference=read_reference(params, checkpoint) if params.solver == "reference" else None,
-        ladder=read_forced(params.forced) if params.model == "auto" else None,
+        selection=read_forced(params.fixed_parts) if params.model == "auto" else None,
     )
 
 
@@ -71,7 +71,7 @@ def read_forced(text: str) -> frozenset[str]:
     """Parts of the model that are not chosen; InputError for one that there is not."""
     forced = frozenset(filter(None, (name.strip() for name in text.split(","))))
     for name in sorted(forced.difference(PARTS)):
-        raise unknown_name("part of the model", name, PARTS, "--set inverse_render.forced")
+        raise unknown_name("part of the model", name, PARTS, "--set inverse_render.fixed_parts")
     return forced
 
 
@@ -81,7 +81,7 @@ def read_reference(params: Parameters, checkpoint: Path | None = None) -> Refere
     own = {name.removeprefix(prefix): value for name, value in given.items() if name.startswith(prefix)}
     if own["device"] == "cuda" and not torch.cuda.is_available():
         raise InputError("no such device here", where="--set inverse_render.reference_device", got="cuda",
-                         mend="take cpu, or a machine and a build of torch with CUDA")
+                         hint="take cpu, or a machine and a build of torch with CUDA")
     samples = {name: own.pop(f"{name}_samples") for name in ("light", "cosine", "lobe")}
     weights = {name: own.pop(name) for name in ("mask", "laplacian", "white_light", "roughness_variation", "diffuse")}
     return ReferenceSettings(

@@ -11,10 +11,10 @@ from shared.gather import Picture, SurfaceViewer
 from shared.mesh import Mesh
 from shared.read_ahead import read_ahead
 from shared.shading import Material, VertexShading
-from shared.solve.appearance import Settings
+from shared.solve.appearance import AppearanceSettings
 from shared.solve.capture import (
     Capture,
-    Scenery,
+    PrecomputedTransfer,
     Sizes,
     build_capture,
     face_front,
@@ -64,12 +64,12 @@ class InverseSettings:
     """sizes of the light's problem, its settings, frames it is solved from, edge of the maps, hold-out period.
 
     shape: how the mesh is refined, None: it stays as it is; fit_frames: how many frames to fit, chosen to cover the
-    face, 0: all but those held out; reference: solve by the published algorithm instead; ladder: choose the model, up
-    to what the settings say, and leave only the named parts of it as they say; specular_widths: over which, relative
+    face, 0: all but those held out; reference: solve by the published algorithm instead; selection: choose the model,
+    up to what the settings say, and leave only the named parts of it as they say; specular_widths: over which, relative
     to the map, texels share their specular intensity: what held-out frames choose from."""
 
     sizes: Sizes = field(default_factory=Sizes)
-    appearance: Settings = field(default_factory=Settings)
+    appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
     light_frames: int = 48
     map_size: int = 1024
     hold_out_every: int = 8
@@ -77,7 +77,7 @@ class InverseSettings:
     fit_frames: int = 0
     reference: ReferenceSettings | None = None
     normal_map: bool = True
-    ladder: frozenset[str] | None = None
+    selection: frozenset[str] | None = None
     specular_widths: tuple[float, ...] = (np.inf, 1 / 16, 1 / 64)
 
 
@@ -129,14 +129,15 @@ def segment_vertices(inputs: InverseInputs, names: tuple[str, ...]) -> np.ndarra
 
 
 def capture_skin(
-    inputs, viewer, scenery: Scenery, frames: tuple[np.ndarray, np.ndarray], moves: str, count: int, progress
+    inputs, viewer, precomputed: PrecomputedTransfer, frames: tuple[np.ndarray, np.ndarray], moves: str, count: int,
+    progress
 ) -> Capture:
     """What at most count points of the face's skin show; frames: which, and which of them are fitted."""
     chosen, fitted = frames
     skin = segment_vertices(inputs, FACE_SKIN)
     return build_capture(
         viewer,
-        scenery,
+        precomputed,
         read_ahead(map(inputs.picture, progress(chosen, "gathering samples"))),
         inputs.camera_from_head[chosen],
         lens_of_frames(inputs.intrinsics, chosen),
@@ -151,23 +152,23 @@ def capture_skin(
 
 
 def shade_vertices(
-    inputs, appearance: Settings, viewer, scenery: Scenery, solution: Solution, progress
+    inputs, appearance: AppearanceSettings, viewer, precomputed: PrecomputedTransfer, solution: Solution, progress
 ) -> VertexShading:
     """Shading of all vertices that some frame faces, in all frames."""
     index = np.nonzero(face_front(viewer, inputs.camera_from_head, -0.1))[0]
     points = mesh_points(viewer.mesh, index)
-    transfer = scenery.trace(points, lambda batches: progress(batches, "tracing the surface"))
+    transfer = precomputed.trace(points, lambda batches: progress(batches, "tracing the surface"))
     state = solution.state
-    local = None if solution.gloss is None else solution.gloss.roughness(points.positions)
+    local = None if solution.local_roughness_fit is None else solution.local_roughness_fit.roughness(points.positions)
     return VertexShading(
         index,
         viewer.mesh.vertices,
         points,
         transfer,
-        scenery.node_transfer,
+        precomputed.node_transfer,
         Material(state.node_albedo, state.specular, state.roughness, local),
         state.light,
-        scenery.directions,
+        precomputed.directions,
         inputs.camera_from_head,
         appearance.light_moves(inputs.moves),
         bounce=appearance.bounce,

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shared.chart import ChartSight
+from shared.chart import ChartObservation
 from shared.errors import InputError
 from shared.gather import Picture
 from shared.geometry import (
@@ -27,7 +27,7 @@ from shared.geometry import (
 )
 from shared.mesh import Mesh, normalised
 from shared.solve.reshape import track_points
-from shared.texture_match import Matches, MeanTexture, match_textures
+from shared.texture_match import ClipTexture, Matches, match_textures
 
 MATCHES, LEAST_MATCHES = 2000, 300
 """Texels that a pose is solved from, and fewer than which show that the clips have no skin in common."""
@@ -71,11 +71,12 @@ class JointInputs:
     def _first(self, clip: int) -> int:
         return int(np.searchsorted(self.light_index, clip))
 
-    def chart_sights(self) -> tuple[ChartSight, ...]:
+    def chart_observations(self) -> tuple[ChartObservation, ...]:
         """The colour chart of the first clip that shows one: one clip's scale is that of all."""
         for k, clip in enumerate(self.clips):
-            if sights := clip.chart_sights():
-                return tuple(replace(sight, frame=sight.frame + self._first(k)) for sight in sights)
+            if observations := clip.chart_observations():
+                return tuple(replace(observation,
+                                     frame=observation.frame + self._first(k)) for observation in observations)
         return ()
 
     def describe(self) -> list[dict]:
@@ -85,7 +86,7 @@ class JointInputs:
                 for k, (count, px) in enumerate(facts)]
 
 
-def join_clips(clips: Sequence, textures: Sequence[MeanTexture]) -> JointInputs:
+def join_clips(clips: Sequence, textures: Sequence[ClipTexture]) -> JointInputs:
     """Clips (shared.io.clip_inputs.ClipInputs) in the head space of the one that knows depth best; textures: theirs.
 
     Clips without tracks, whose mesh and poses were given, share a head space already. InputError where the clips show
@@ -164,7 +165,7 @@ def place(main, clip, matches: Matches) -> Placed:
     if len(matches) < LEAST_MATCHES:
         raise InputError("the clips do not show the same skin", where=clip.frames.source_name,
                          got=f"{len(matches)} texels alike", expected=f"{LEAST_MATCHES} or more",
-                         mend="film one face, the same in all clips and sharp, or solve each clip by itself")
+                         hint="film one face, the same in all clips and sharp, or solve each clip by itself")
     chosen, poses = matches.thinned(MATCHES), clip.camera_from_head
     pixels = project(chosen.second, poses, clip.intrinsics)[0]
     towards = normalised(camera_centres(poses)[:, None] - chosen.second)

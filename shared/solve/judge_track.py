@@ -20,7 +20,7 @@ MOUTH_RATIO = 2.0
 LEAST_OUTLIER_PX = 0.25
 
 
-def judge_frames(track: HeadTrack, outlier_factor: float) -> tuple[np.ndarray, list[str]]:
+def frames_that_fit(track: HeadTrack, outlier_factor: float) -> tuple[np.ndarray, list[str]]:
     """Which of the tracked frames fit [U] bool, and why each of the others does not ('' where it fits).
 
     A frame whose median track error is outlier_factor times the clip's, and LEAST_OUTLIER_PX at least, does not.

@@ -1,4 +1,5 @@
-"""The ladder on a clip: the small captures that it is climbed on, the mesh's rungs, and what is then left to solve."""
+"""Model selection on a clip: the small captures that it looks at, the mesh's candidates, and what is then left to
+solve."""
 
 from __future__ import annotations
 
@@ -10,30 +11,32 @@ import numpy as np
 
 from shared.gather import SurfaceViewer
 from shared.solve.appearance import Capture
-from shared.solve.capture import Sizes, hold_out, set_scenery, spread_frames
+from shared.solve.capture import Sizes, hold_out, precompute_transfer, spread_frames
 from shared.solve.fit_appearance import Solution
 from shared.solve.inverse_problem import InverseInputs, InverseSettings, capture_skin, frames_of
-from shared.solve.ladder import FEWEST_HELD_OUT, Ladder, allowed_rungs, describe, serves
-from shared.solve.ladder_gloss import POOLING, VARIATIONS, Gloss, GlossLadder, segments_at
-from shared.solve.reshape import reshape
+from shared.solve.ladder import FEWEST_HELD_OUT, ModelSelection, allowed_candidates, describe, serves
+from shared.solve.ladder_gloss import POOLING, VARIATIONS, SpecularSelection, SpecularVariation, segments_at
+from shared.solve.reshape import refine_shape
 from shared.solve.shape import Reflectance, ShapeSettings
 
-CLIMB_SIZES = Sizes(points=600, directions=768, nodes=200)
-CLIMB_FRAMES, CLIMB_HOLD_OUT = 36, 3
-"""Frames that the ladder looks at, and which share of them judges: one in so many, and all that are held out anyway."""
+SELECTION_SIZES = Sizes(points=600, directions=768, nodes=200)
+SELECTION_FRAMES, SELECTION_HOLD_OUT = 36, 3
+"""Frames that model selection looks at, and which share of them judges: one in so many, and all that are held out
+anyway."""
 
 
 @dataclass(frozen=True)
-class Climbed:
-    """The clip with the mesh that was chosen, what is left to solve, a solution to start from, how its gloss varies,
-    what became of the mesh, and the record of the rungs."""
+class SelectedModel:
+    """The clip with the mesh that was chosen, what is left to solve, a solution to start from, how its
+    specular terms vary,
+    what became of the mesh, and the record of the candidates."""
 
     inputs: InverseInputs
     settings: InverseSettings
     start: Solution | None = None
-    gloss: Gloss | None = None
+    variation: SpecularVariation | None = None
     shape_record: dict = field(default_factory=lambda: {"refined": False})
-    rungs: tuple[dict, ...] = ()
+    candidates: tuple[dict, ...] = ()
 
 
 class Made(dict):
@@ -53,123 +56,128 @@ class SmallClip:
 
     def __init__(self, inputs: InverseInputs, settings: InverseSettings, fitted: np.ndarray, chart, progress: Callable):
         self.inputs, full = inputs, settings.sizes
-        self.sizes = Sizes(*(min(getattr(full, name), getattr(CLIMB_SIZES, name)) for name in vars(CLIMB_SIZES)))
+        self.sizes = Sizes(**{name: min(getattr(full, name), most) for name, most in vars(SELECTION_SIZES).items()})
         viewer = SurfaceViewer.of(inputs.mesh)
-        self.scenery = Made(lambda visibility: set_scenery(viewer, self.sizes, visibility))
-        frames = frames_to_climb(inputs, settings, fitted)
+        self.precomputed = Made(lambda visibility: precompute_transfer(viewer, self.sizes, visibility))
+        frames = selection_frames(inputs, settings, fitted)
         moves, count = settings.appearance.light_moves(inputs.moves), self.sizes.points
-        seen = capture_skin(inputs, viewer, self.scenery[True], frames, moves, count, progress)
+        seen = capture_skin(inputs, viewer, self.precomputed[True], frames, moves, count, progress)
         self.captures = Made(self._without_visibility)
         self.captures[True] = replace(seen, chart=chart)
 
     def _without_visibility(self, visibility: bool) -> Capture:
-        seen, bare = self.captures[True], self.scenery[visibility]
+        seen, bare = self.captures[True], self.precomputed[visibility]
         return replace(seen, transfer=bare.trace(seen.points), node_transfer=bare.node_transfer)
 
 
-def frames_to_climb(
+def selection_frames(
     inputs: InverseInputs, settings: InverseSettings, fitted: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frames that the ladder looks at, and which of them are fitted: none that is held out of the whole solve."""
+    """Frames that model selection looks at, and which of them are fitted: none that is held out of the whole solve."""
     if settings.fit_frames:
-        return frames_of(inputs, settings, CLIMB_FRAMES, fitted)
+        return frames_of(inputs, settings, SELECTION_FRAMES, fitted)
     lights = inputs.light_index
-    chosen = spread_frames(len(fitted), CLIMB_FRAMES, lights)
-    return chosen, fitted[chosen] & hold_out(len(chosen), CLIMB_HOLD_OUT, lights[chosen])
+    chosen = spread_frames(len(fitted), SELECTION_FRAMES, lights)
+    return chosen, fitted[chosen] & hold_out(len(chosen), SELECTION_HOLD_OUT, lights[chosen])
 
 
-def climb(
+def select(
     inputs: InverseInputs, settings: InverseSettings, fitted: np.ndarray, chart, progress: Callable, note: Callable
-) -> Climbed:
+) -> SelectedModel:
     """Chooses the model of a clip. fitted [F] bool; chart: what a colour chart says of the light, or None."""
-    climber = _Climber(inputs, settings, fitted, chart, progress, note)
-    if climber.held_out < FEWEST_HELD_OUT:
-        note(f"the model is not chosen: {climber.held_out} frames are too few to judge it by; all of it is solved")
-        return Climbed(inputs, replace(settings, ladder=None))
-    climber.climb()
-    return climber.climbed()
+    selector = _ClipSelection(inputs, settings, fitted, chart, progress, note)
+    if selector.held_out < FEWEST_HELD_OUT:
+        note(f"the model is not chosen: {selector.held_out} frames are too few to judge it by; all of it is solved")
+        return SelectedModel(inputs, replace(settings, selection=None))
+    selector.select()
+    return selector.selected()
 
 
-class _Climber:
+class _ClipSelection:
     """Appearance on the tracked mesh, then the mesh, then the appearance again where the mesh changed."""
 
     def __init__(self, inputs, settings: InverseSettings, fitted: np.ndarray, chart, progress, note):
         self.settings, self.fitted, self.chart = settings, fitted, chart
-        self.progress, self.note, self.rungs = progress, note, []
-        self.forced = settings.ladder
+        self.progress, self.note, self.candidates = progress, note, []
+        self.forced = settings.selection
         self.tracked = self.small = SmallClip(inputs, settings, fitted, chart, progress)
         self.held_out = int((~self.small.captures[True].fitted).sum())
-        self.ladder = self._ladder(self.small)
+        self.selection = self._selection(self.small)
         self.shape_record: dict = {"refined": False}
-        self.gloss = Gloss()
+        self.variation = SpecularVariation()
 
-    def climb(self) -> None:
-        """All parts; the result stands in small, ladder.present and gloss."""
-        self.ladder.climb()
+    def select(self) -> None:
+        """All parts; the result stands in small, selection.present and variation."""
+        self.selection.select()
         if self.settings.shape is not None and self.small.inputs.face_segment is not None:
-            self._climb_geometry(self.settings.shape)
-        if self.ladder.present.model.specular != "none":
-            self._climb_gloss()
+            self._select_geometry(self.settings.shape)
+        if self.selection.present.model.specular != "none":
+            self._select_specular()
 
-    def _climb_geometry(self, shape: ShapeSettings) -> None:
-        before = self.ladder.present
+    def _select_geometry(self, shape: ShapeSettings) -> None:
+        before = self.selection.present
         for subdivisions in range(shape.subdivisions + 1):
             if not self._refine(replace(shape, subdivisions=subdivisions, looks_back=False)):
                 break
         if self.small is not self.tracked:
-            after = self.ladder.present
+            after = self.selection.present
             residuals = {"before": float(before.errors.mean()), "after": float(after.errors.mean())}
             stopped = self.small.inputs.stopped
             self.shape_record = {"refined": True, "held_out": residuals, "stopped_vertices": stopped}
-            self.ladder.climb()
+            self.selection.select()
 
-    def _climb_gloss(self) -> None:
-        present, inputs, settings = self.ladder.present, self.small.inputs, self.settings.appearance
+    def _select_specular(self) -> None:
+        present, inputs, settings = self.selection.present, self.small.inputs, self.settings.appearance
         capture = self.small.captures[present.model.visibility != "off"]
         segment = segments_at(inputs.mesh, inputs.face_segment, capture.points.positions)
         free = {"specular": True, "roughness": settings.local_roughness}
-        rungs = {part: VARIATIONS[: 3 if free[part] and part not in self.forced else 1] for part in free}
+        candidates = {part: VARIATIONS[: 3 if free[part] and part not in self.forced else 1] for part in free}
         applied = present.model.applied(settings)
-        self.gloss = GlossLadder(capture, applied, present, segment, rungs, self._report).climb()
+        self.variation = SpecularSelection(capture, applied, present, segment, candidates, self._report).select()
 
     def _refine(self, shape: ShapeSettings) -> bool:
         """Refines the tracked mesh, or goes on refining it, under the present solution; kept where that serves."""
         start = time.perf_counter()
-        below, tracked, below_is_tracked = self.ladder.present, self.tracked.inputs, self.small is self.tracked
+        below, tracked, below_is_tracked = self.selection.present, self.tracked.inputs, self.small is self.tracked
         appearance = below.model.applied(self.settings.appearance)
-        known = Reflectance.of(below.solution, self.small.scenery[appearance.visibility])
+        known = Reflectance.of(below.solution, self.small.precomputed[appearance.visibility])
         frames = frames_of(tracked, self.settings, shape.frames, self.fitted)
-        how = appearance, self.small.sizes, shape, self.progress, self.note
-        reshaped = reshape(tracked, frames, known, *how, begun=None if below_is_tracked else self.small.inputs)
-        small = SmallClip(reshaped, self.settings, self.fitted, self.chart, self.progress)
-        ladder = self._ladder(small)
-        ladder.begin(below.model, below.solution)
-        trial = replace(ladder.present, seconds=time.perf_counter() - start)
+        refined = refine_shape(
+            tracked, frames, reflectance=known, appearance=appearance, sizes=self.small.sizes, settings=shape,
+            progress=self.progress, note=self.note, begun=None if below_is_tracked else self.small.inputs,
+        )
+        small = SmallClip(refined, self.settings, self.fitted, self.chart, self.progress)
+        selection = self._selection(small)
+        selection.begin(below.model, below.solution)
+        trial = replace(selection.present, seconds=time.perf_counter() - start)
         better = "geometry" in self.forced or serves(below.errors, trial.errors)
         name = "refined" if shape.subdivisions == 0 else f"subdivided_{shape.subdivisions}"
         self._report(describe("geometry", name, trial, below, better))
         if better:
-            self.small, self.ladder = small, ladder
+            self.small, self.selection = small, selection
         return better
 
-    def _ladder(self, small: SmallClip) -> Ladder:
-        rungs = allowed_rungs(self.settings.appearance, self.forced)
-        return Ladder(small.captures, self.settings.appearance, rungs, self._report)
+    def _selection(self, small: SmallClip) -> ModelSelection:
+        candidates = allowed_candidates(self.settings.appearance, self.forced)
+        return ModelSelection(small.captures, self.settings.appearance, candidates, self._report)
 
     def _report(self, record: dict) -> None:
-        self.rungs.append(record)
+        self.candidates.append(record)
         fall = "" if record["fall"] is None else f", {-record['fall']:+.6f} +- {record['standard_error']:.6f}"
-        said = "climbed" if record["climbed"] else "not climbed"
+        said = "accepted" if record["climbed"] else "not accepted"
         text = f"{record['part']} {record['rung']}: {record['held_out']:.6f} held out{fall}"
-        self.note(f"ladder: {text}; {said} ({record['seconds']:.1f} s)")
+        self.note(f"model selection: {text}; {said} ({record['seconds']:.1f} s)")
 
-    def climbed(self) -> Climbed:
+    def selected(self) -> SelectedModel:
         """What is left to solve."""
-        present, settings, forced = self.ladder.present, self.settings, self.forced
+        present, settings, forced = self.selection.present, self.settings, self.forced
         appearance = present.model.applied(settings.appearance)
         local = appearance.local_roughness and "roughness" in forced
-        appearance = replace(appearance, local_roughness=local, fit_roughness=False)  # the ladder found it
-        widths = settings.specular_widths if "specular" in forced else POOLING[self.gloss.specular]
+        appearance = replace(appearance, local_roughness=local, fit_roughness=False)  # model selection found it
+        widths = settings.specular_widths if "specular" in forced else POOLING[self.variation.specular]
         settings = replace(settings, appearance=appearance, shape=None, specular_widths=widths)
-        found = self.gloss, self.shape_record, tuple(self.rungs)
-        return Climbed(self.small.inputs, settings, present.solution, *found)
+        return SelectedModel(
+            self.small.inputs, settings, start=present.solution, variation=self.variation,
+            shape_record=self.shape_record,
+            candidates=tuple(self.candidates),
+        )

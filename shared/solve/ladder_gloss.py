@@ -1,7 +1,9 @@
-"""The ladder's upper rungs: specular intensity and roughness that vary over the skin, by face segment or locally.
+"""Model selection's upper candidates: specular intensity and roughness that vary over the skin, by face segment or
+locally.
 
-Under the light that was found, the points' equations of gloss (local_roughness) are summed over all of the skin, over a
-face segment, or over a neighbourhood. Albedo is eliminated anew each time; held-out frames decide as on every rung.
+Under the light that was found, the points' specular equations (local_roughness) are summed over all of the skin, over a
+face segment, or over a neighbourhood. Albedo is projected out anew each time; held-out frames decide as on every
+candidate.
 """
 
 from __future__ import annotations
@@ -15,11 +17,11 @@ import torch
 from scipy.spatial import cKDTree
 
 from shared.mesh import Mesh
-from shared.solve.appearance import AppearanceSolver, Settings
+from shared.solve.appearance import AppearanceSettings, AppearanceSolver
 from shared.solve.capture import Capture
 from shared.solve.fit_appearance import Solution
 from shared.solve.ladder import LOOK_AHEAD, Trial, describe, serves
-from shared.solve.local_roughness import GlossEquations, gloss_equations
+from shared.solve.local_roughness import SpecularEquations, specular_equations_of
 
 VARIATIONS = ("one_value", "by_segment", "local")
 POOLING = {"one_value": (np.inf,), "by_segment": (np.inf,), "local": (1 / 16, 1 / 64)}
@@ -27,7 +29,7 @@ POOLING = {"one_value": (np.inf,), "by_segment": (np.inf,), "local": (1 / 16, 1 
 
 
 @dataclass(frozen=True)
-class SegmentGloss(GlossEquations):
+class SegmentSpecular(SpecularEquations):
     """Equations summed over face segments; segment [P] of each point."""
 
     segment: np.ndarray | None = None
@@ -44,22 +46,23 @@ class SegmentGloss(GlossEquations):
 
 
 @dataclass(frozen=True)
-class Gloss:
-    """How specular intensity and roughness vary: the rungs, and the equations behind them (None: one value)."""
+class SpecularVariation:
+    """How specular intensity and roughness vary: the candidates, and the equations behind them (None: one value)."""
 
     specular: str = "one_value"
     roughness: str = "one_value"
-    specular_equations: GlossEquations | None = None
-    roughness_equations: GlossEquations | None = None
+    specular_equations: SpecularEquations | None = None
+    roughness_equations: SpecularEquations | None = None
 
     def worn_by(self, solution: Solution) -> Solution:
         """A solution of the same model, with roughness and specular intensity that vary about its own values."""
         state, found = solution.state, {}
-        for name, equations in (("gloss", self.roughness_equations), ("local_specular", self.specular_equations)):
+        for name, equations in (("local_roughness_fit", self.roughness_equations),
+                                ("local_specular", self.specular_equations)):
             if equations is not None:
                 logs = equations.logs - equations.logs.mean() + np.log(state.roughness)
                 found[name] = replace(equations, logs=logs, specular=(state.specular, equations.specular[1]))
-        return replace(solution, gloss_record={"chosen": self.roughness}, **found)
+        return replace(solution, roughness_record={"chosen": self.roughness}, **found)
 
 
 def segments_at(mesh: Mesh, face_segment: np.ndarray | None, positions: np.ndarray) -> np.ndarray | None:
@@ -71,19 +74,20 @@ def segments_at(mesh: Mesh, face_segment: np.ndarray | None, positions: np.ndarr
     return of_vertex[cKDTree(mesh.vertices).query(positions)[1]]
 
 
-class GlossLadder:
-    """Climbs the variation of gloss under a solution that has highlights.
+class SpecularSelection:
+    """Selects the variation of specular terms under a solution that has highlights.
 
-    segment [P] of the capture's points, or None; rungs: of "specular" and "roughness"; report: receives the records.
+    segment [P] of the capture's points, or None; candidates: of "specular" and "roughness"; report: receives the
+    records.
     """
 
     def __init__(
         self,
         capture: Capture,
-        settings: Settings,
+        settings: AppearanceSettings,
         trial: Trial,
         segment: np.ndarray | None,
-        rungs: Mapping[str, tuple[str, ...]],
+        candidates: Mapping[str, tuple[str, ...]],
         report: Callable[[dict], None],
     ):
         self.solver = solver = AppearanceSolver.at(capture, settings, trial.solution.state)
@@ -91,31 +95,31 @@ class GlossLadder:
         self.irradiance, self.reflection = solver.forward(solver.state.light)
         model = solver.model(self.irradiance, self.reflection)
         self.weight = solver.weights(model)
-        solver.measure_misfit(model, self.weight)
-        local = gloss_equations(solver, self.irradiance, self.weight * solver.fitted)
-        self.pools: dict[str, GlossEquations | None] = {"one_value": None, "local": local}
+        solver.measure_reduced_chi_square(model, self.weight)
+        local = specular_equations_of(solver, self.irradiance, self.weight * solver.fitted)
+        self.pools: dict[str, SpecularEquations | None] = {"one_value": None, "local": local}
         if segment is not None:
-            by_segment = SegmentGloss(**vars(local), segment=segment)
+            by_segment = SegmentSpecular(**vars(local), segment=segment)
             self.pools["by_segment"] = by_segment.centred()
-        self.trial, self.rungs, self.report = trial, rungs, report
+        self.trial, self.candidates, self.report = trial, candidates, report
 
-    def climb(self) -> Gloss:
-        """The variation that no rung beyond serves better."""
+    def select(self) -> SpecularVariation:
+        """The variation that no candidate beyond serves better."""
         chosen = {"specular": "one_value", "roughness": "one_value"}
         present = self._try(chosen)
         for part in chosen:
             missed = 0
-            for rung in [name for name in self.rungs[part][1:] if name in self.pools]:
-                trial = self._try(chosen | {part: rung})
+            for candidate in [name for name in self.candidates[part][1:] if name in self.pools]:
+                trial = self._try(chosen | {part: candidate})
                 better = serves(present.errors, trial.errors)
-                self.report(describe(part, rung, trial, present, better))
+                self.report(describe(part, candidate, trial, present, better))
                 if better:
-                    chosen, present, missed = chosen | {part: rung}, trial, 0
+                    chosen, present, missed = chosen | {part: candidate}, trial, 0
                 else:
                     missed += 1
                 if missed == LOOK_AHEAD:
                     break
-        return Gloss(**chosen, **{f"{part}_equations": self.pools[name] for part, name in chosen.items()})
+        return SpecularVariation(**chosen, **{f"{part}_equations": self.pools[name] for part, name in chosen.items()})
 
     def _try(self, chosen: Mapping[str, str]) -> Trial:
         begun, solver = time.perf_counter(), self.solver
@@ -127,6 +131,6 @@ class GlossLadder:
         intensity = solver.state.specular if specular is None else specular.specular_at(positions)
         intensity = np.broadcast_to(intensity, len(positions)).astype(np.float32)
         shown = reflection * torch.from_numpy(intensity)[None, :, None]
-        albedo = solver.eliminate(self.irradiance, shown, self.weight)
+        albedo = solver.best_albedo(self.irradiance, shown, self.weight)
         errors = solver.frame_errors(albedo * self.irradiance + shown)[~solver.capture.fitted]
         return replace(self.trial, errors=errors, seconds=time.perf_counter() - begun)

@@ -1,6 +1,6 @@
 """A clip's light and mesh: light on the tracked mesh, the mesh refined under it, light anew, and which mesh is kept.
 
-Either with the full model or with the one that the ladder leads to.
+Either with the full model or with the one that model selection leads to.
 """
 
 from __future__ import annotations
@@ -8,58 +8,60 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from shared.gather import SurfaceViewer
-from shared.solve.capture import Capture, Scenery, set_scenery
+from shared.solve.capture import Capture, PrecomputedTransfer, precompute_transfer
 from shared.solve.fit_appearance import Solution, fit_appearance
 from shared.solve.inverse_problem import InverseInputs, InverseSettings, capture_skin, frames_of
-from shared.solve.ladder_clip import climb
-from shared.solve.reshape import reshape, subdivided_to
+from shared.solve.ladder_clip import select
+from shared.solve.reshape import refine_shape, subdivided_to
 from shared.solve.shape import Reflectance
 
 
 @dataclass(frozen=True)
 class LitClip:
-    """A clip before its texture pass: the inputs with the mesh that was chosen and its viewer and scenery, settings of
-    the model that was chosen, the capture and its solution, what became of the mesh, the ladder's rungs; tracked: the
-    solution before the mesh was refined, where it was tried."""
+    """A clip before its texture pass: the inputs with the mesh that was chosen and its viewer and precomputed transfer,
+    settings of the model that was chosen, the capture and its solution, what became of the mesh, model selection's
+    candidates; tracked: the solution before the mesh was refined, where it was tried."""
 
     inputs: InverseInputs
     settings: InverseSettings
     viewer: SurfaceViewer
-    scenery: Scenery
+    precomputed: PrecomputedTransfer
     capture: Capture
     solution: Solution
     shape_record: dict
-    rungs: tuple[dict, ...]
+    candidates: tuple[dict, ...]
     tracked: Solution | None = None
 
 
 def solve_light(
     inputs: InverseInputs, settings: InverseSettings, viewer: SurfaceViewer, fitted, chart, progress, note
 ) -> LitClip:
-    """Light and mesh: those of the full model, or of the one that the ladder leads to."""
-    start, gloss, tracked, shape_record, rungs = None, None, None, {"refined": False}, ()
-    if settings.ladder is not None:
-        climbed = climb(inputs, settings, fitted, chart, progress, note)
-        inputs, settings, start, gloss = climbed.inputs, climbed.settings, climbed.start, climbed.gloss
-        shape_record, rungs = climbed.shape_record, climbed.rungs
+    """Light and mesh: those of the full model, or of the one that model selection leads to."""
+    start, variation, tracked, shape_record, candidates = None, None, None, {"refined": False}, ()
+    if settings.selection is not None:
+        selected = select(inputs, settings, fitted, chart, progress, note)
+        inputs, settings, start, variation = selected.inputs, selected.settings, selected.start, selected.variation
+        shape_record, candidates = selected.shape_record, selected.candidates
         viewer = SurfaceViewer.of(inputs.mesh)
-    scenery = set_scenery(viewer, settings.sizes, settings.appearance.visibility)
-    solution, capture = _fit_light(inputs, settings, viewer, scenery, fitted, chart, progress, note, start)
+    precomputed = precompute_transfer(viewer, settings.sizes, settings.appearance.visibility)
+    solution, capture = _fit_light(inputs, settings, viewer, precomputed, fitted, chart, progress, note, start)
     if settings.shape is not None and inputs.face_segment is not None:
-        known = Reflectance.of(solution, scenery)
+        known = Reflectance.of(solution, precomputed)
         frames = frames_of(inputs, settings, settings.shape.frames, fitted)
-        reshaped = reshape(inputs, frames, known, settings.appearance, settings.sizes, settings.shape, progress, note)
-        viewer_then = SurfaceViewer.of(reshaped.mesh, subdivided_to(inputs.mesh, reshaped.mesh).vertices)
-        scenery_then = set_scenery(viewer_then, settings.sizes, settings.appearance.visibility)
-        more = viewer_then, scenery_then, fitted, chart, progress, note, solution
-        then, capture_then = _fit_light(reshaped, settings, *more)
-        tracked, shape_record = solution, judge_shape(solution, then) | {"stopped_vertices": reshaped.stopped}
+        refined = refine_shape(inputs, frames, known, settings.appearance, settings.sizes, settings.shape, progress,
+                               note)
+        viewer_then = SurfaceViewer.of(refined.mesh, subdivided_to(inputs.mesh, refined.mesh).vertices)
+        precomputed_then = precompute_transfer(viewer_then, settings.sizes, settings.appearance.visibility)
+        then, capture_then = _fit_light(
+            refined, settings, viewer_then, precomputed_then, fitted, chart, progress, note, start=solution
+        )
+        tracked, shape_record = solution, judge_shape(solution, then) | {"stopped_vertices": refined.stopped}
         note(f"refined mesh: {shape_record}")
         if shape_record["refined"]:
-            inputs, viewer, scenery = reshaped, viewer_then, scenery_then
+            inputs, viewer, precomputed = refined, viewer_then, precomputed_then
             solution, capture = then, capture_then
-    solution = solution if gloss is None else gloss.worn_by(solution)
-    return LitClip(inputs, settings, viewer, scenery, capture, solution, shape_record, rungs, tracked)
+    solution = solution if variation is None else variation.worn_by(solution)
+    return LitClip(inputs, settings, viewer, precomputed, capture, solution, shape_record, candidates, tracked)
 
 
 def judge_shape(before: Solution, after: Solution) -> dict:
@@ -70,14 +72,17 @@ def judge_shape(before: Solution, after: Solution) -> dict:
 
 
 def _fit_light(
-    inputs, settings, viewer, scenery: Scenery, fitted, chart, progress, note, start: Solution | None = None
+    inputs, settings, viewer, precomputed: PrecomputedTransfer, fitted, chart, progress, note,
+    start: Solution | None = None
 ) -> tuple[Solution, Capture]:
     frames = frames_of(inputs, settings, settings.light_frames, fitted)
     moves, count = settings.appearance.light_moves(inputs.moves), settings.sizes.points
-    capture = replace(capture_skin(inputs, viewer, scenery, frames, moves, count, progress), chart=chart)
-    climbed = settings.ladder is not None and start is not None
-    step = (lambda record: note(_describe(record))), start, climbed
-    return fit_appearance(capture, settings.appearance, *step), capture
+    capture = replace(capture_skin(inputs, viewer, precomputed, frames, moves, count, progress), chart=chart)
+    selected = settings.selection is not None and start is not None
+    solution = fit_appearance(
+        capture, settings.appearance, report=lambda record: note(_describe(record)), start=start, keep_start=selected
+    )
+    return solution, capture
 
 
 def _describe(record: dict) -> str:

@@ -1,4 +1,4 @@
-"""One Gauss-Newton step of the light's parameters with the albedo eliminated, and the loop around it.
+"""One Gauss-Newton step of the light's parameters with the albedo projected out, and the loop around it.
 
 The step solves (J^T W J + priors) d = -gradient by conjugate gradients. J is never formed: its product with a change
 of light renders that change for all points and frames and removes what a change of albedo, and once highlights count
@@ -16,17 +16,17 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from shared.solve.appearance import ALBEDO_PULL, LARGEST_ROUGHENING, AppearanceSolver
-from shared.solve.gloss_fit import GlossFit
+from shared.solve.appearance import ALBEDO_PULL, LARGEST_ROUGHNESS_STEP, AppearanceSolver
+from shared.solve.gloss_fit import SpecularFit
 from shared.solve.products import per_channel, per_channel_transposed, reflect, reflect_transposed
-from shared.solve.scale import settle_scale
+from shared.solve.scale import resolve_scale
 from shared.solve.skin_prior import SkinPull
 
 _LARGEST_RISE, _LARGEST_FALL = 1.5, 4.0
 """Bounds on a step of the log light, each texel by itself: the linearisation of exp holds for a rise of this size; a
 texel that wants to go dark may fall further, and must not slow the others down."""
 
-_SETTLED = 0.03
+_CONVERGED = 0.03
 """The scale follows the highlights once a step changes the log roughness by no more."""
 
 PRECISION_OF_SEVERAL = (60, 0.002)
@@ -74,29 +74,30 @@ class LightStep:
         self.weight = solver.weights(solver.model(self.irradiance, self.reflection)) * solver.fitted
         self.evidence = solver.evidence(self.weight)
         self.before = 0.0
-        self.gloss = self._fit_gloss(self.light, self.irradiance, self.reflection)
-        self.highlights = self._highlights(self.gloss, self.reflection)
+        self.specular_fit = self._fit_specular(self.light, self.irradiance, self.reflection)
+        self.highlights = self._highlights(self.specular_fit, self.reflection)
         self._fit_points(self.highlights)
         self.skin = self._skin_pull()
 
-    def _fit_gloss(self, light: np.ndarray, irradiance: torch.Tensor, reflection: torch.Tensor) -> GlossFit | None:
+    def _fit_specular(self, light: np.ndarray, irradiance: torch.Tensor,
+                      reflection: torch.Tensor) -> SpecularFit | None:
         """Intensity and roughness for a light, once highlights count."""
         if not self.solver.trust_highlights:
             return None
         slope = self.solver.forward_slope(light, irradiance) if self.seeks_roughness else None
-        return GlossFit(self.solver, irradiance, reflection, slope, self.weight, self.evidence)
+        return SpecularFit(self.solver, irradiance, reflection, slope, self.weight, self.evidence)
 
-    def _highlights(self, gloss: GlossFit | None, reflection: torch.Tensor) -> torch.Tensor:
-        return self.solver.state.specular * reflection if gloss is None else gloss.highlights
+    def _highlights(self, specular_fit: SpecularFit | None, reflection: torch.Tensor) -> torch.Tensor:
+        return self.solver.state.specular * reflection if specular_fit is None else specular_fit.highlights
 
     def _fit_points(self, highlights: torch.Tensor) -> None:
         solver = self.solver
-        self.albedo = solver.eliminate(self.irradiance, highlights, self.weight)
+        self.albedo = solver.best_albedo(self.irradiance, highlights, self.weight)
         solver.state.albedo = self.albedo[..., 0].T.double().numpy()
 
     @property
     def radiance(self) -> torch.Tensor:
-        """The model [3, P, F] that is linearised, all that is eliminated at its best."""
+        """The model [3, P, F] that is linearised, all that is projected out at its best."""
         return self.albedo * self.irradiance + self.highlights
 
     def _skin_pull(self) -> SkinPull | None:
@@ -108,18 +109,18 @@ class LightStep:
         known = (curvature / (curvature + ALBEDO_PULL)).min(0).values
         return self.solver.skin_prior.at(_log_of(self.albedo), known.double().numpy())
 
-    def settle(self) -> float:
+    def resolve_scale(self) -> float:
         """Roughness, specular intensity, the light's scale and the albedo for the present light, weights as they were
         -> by how much the scale changed at most, in the logarithm; while the roughness moves the scale waits, and the
         roughness's change is returned."""
         solver, settings = self.solver, self.solver.settings
         self.irradiance, self.reflection = solver.forward(solver.state.light)
-        roughened = self._roughen()
-        if roughened > _SETTLED:
-            gloss = GlossFit(solver, self.irradiance, self.reflection, None, self.weight, self.evidence)
-            solver.state.specular = max(float(gloss.best[0]), 0.0)
-            self._fit_points(gloss.highlights)
-            return roughened
+        roughness_step = self._update_roughness()
+        if roughness_step > _CONVERGED:
+            specular_fit = SpecularFit(solver, self.irradiance, self.reflection, None, self.weight, self.evidence)
+            solver.state.specular = max(float(specular_fit.best[0]), 0.0)
+            self._fit_points(specular_fit.highlights)
+            return roughness_step
         self._fit_points(solver.state.specular * self.reflection)
         log_albedo, log_irradiance, _ = solver.mean_on_skin(self.albedo, self.irradiance)
         highlights = None
@@ -130,7 +131,7 @@ class LightStep:
         if chart is not None:
             light = np.split(solver.state.light, len(relative))[chart.light]
             chart = chart.log_factor(light, np.exp(log_albedo + log_irradiance + relative[chart.light]))
-        log_factor, specular = settle_scale(
+        log_factor, specular = resolve_scale(
             log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart, relative
         )
         factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]
@@ -141,31 +142,32 @@ class LightStep:
         self._fit_points(solver.state.specular * self.reflection)
         return float(np.abs(log_factor).max())
 
-    def _roughen(self) -> float:
+    def _update_roughness(self) -> float:
         """Moves the roughness, where it is sought, to where highlights in the present light have it -> by how much."""
         solver = self.solver
         if not self.seeks_roughness:
             return 0.0
-        change = self._fit_gloss(solver.state.light, self.irradiance, self.reflection).change_of_roughness
-        roughened = solver.roughen(change)
+        change = self._fit_specular(solver.state.light, self.irradiance, self.reflection).change_of_roughness
+        roughness_step = solver.update_roughness(change)
         self.irradiance, self.reflection = solver.forward(solver.state.light)
-        return roughened
+        return roughness_step
 
     def cost(self, params: np.ndarray) -> float:
-        """Data and priors with albedo and, once highlights count, gloss eliminated; weights held."""
+        """Data and priors with albedo and, once highlights count, specular terms projected out; weights held."""
         return self._judge(params)[0]
 
     def _judge(self, params: np.ndarray) -> tuple[float, float]:
         """That, and the change of the log roughness with which it is reached."""
         solver, light = self.solver, self.model.radiance(params)
         irradiance, reflection = solver.forward(light)
-        gloss = self._fit_gloss(light, irradiance, reflection)
-        highlights = self._highlights(gloss, reflection)
-        albedo = solver.eliminate(irradiance, highlights, self.weight)
+        specular_fit = self._fit_specular(light, irradiance, reflection)
+        highlights = self._highlights(specular_fit, reflection)
+        albedo = solver.best_albedo(irradiance, highlights, self.weight)
         error = albedo * irradiance + highlights - solver.colours
         data = 0.5 * self.evidence * float((self.weight * error.square()).sum())
         known = self.unlikely_skin(albedo) + self.model.prior(params, solver.settings.priors)[0]
-        return (data + known, 0.0) if gloss is None else (data + known + gloss.unlikely, gloss.change_of_roughness)
+        return (data + known, 0.0) if specular_fit is None else (data + known + specular_fit.unlikely,
+                                                                 specular_fit.change_of_roughness)
 
     def unlikely_skin(self, albedo: torch.Tensor) -> float:
         """What the prior on skin costs for an albedo [3, P, 1]."""
@@ -179,8 +181,8 @@ class LightStep:
         result = self.albedo * per_channel(solver.baked, along.permute(2, 0, 1))
         if solver.settings.specular:
             result += solver.state.specular * reflect(solver.lobes, along)
-        pure = solver.off_albedo(result, self.irradiance, self.weight)
-        return result, pure if self.gloss is None else self.gloss.off(pure)
+        pure = solver.project_off_albedo(result, self.irradiance, self.weight)
+        return result, pure if self.specular_fit is None else self.specular_fit.off(pure)
 
     def _pull_of_skin(self, log_albedo: np.ndarray) -> torch.Tensor:
         """Derivative [3, P, F] of the prior on skin at log_albedo [3, P] by the model, whose rise the albedo that is
@@ -203,10 +205,10 @@ class LightStep:
         values = self.evidence * self.weight * (self.radiance - solver.colours)
         if self.skin is not None:
             values = values + self._pull_of_skin(_log_of(self.albedo))
-        gloss = (state.specular,) if self.gloss is None else (
-            float(self.gloss.best[0]), state.specular * self.gloss.change_of_roughness)
+        specular_fit = (state.specular,) if self.specular_fit is None else (
+            float(self.specular_fit.best[0]), state.specular * self.specular_fit.change_of_roughness)
         _, prior, self.prior_product = self.model.prior(state.params, solver.settings.priors)
-        return self._adjoint(values, *gloss) + prior
+        return self._adjoint(values, *specular_fit) + prior
 
     def product(self, change: np.ndarray) -> np.ndarray:
         """Gauss-Newton Hessian times a change [M, 3]."""
@@ -217,14 +219,14 @@ class LightStep:
             values = values + self._pull_of_skin(fall.double().numpy())
         return self._adjoint(values, self.solver.state.specular) + self.prior_product(change)
 
-    def take(self) -> None:
+    def update(self) -> None:
         """Moves the solver's light at constant mean irradiance per channel; halved until the cost falls.
 
         Within the bounds by cutting off what single texels want too much, or by a shorter step as a whole, whichever
         costs less: the one lets a lamp form, the other keeps the direction where many small wishes make up one pattern.
 
-        The scale is left to settle: steps x are taken as Q x with Q = 1 - u g', where u raises the log light by one
-        and g is the derivative of the log mean irradiance (g' u = 1), so that g' Q x = 0.
+        The scale is left to resolve_scale: steps x are taken as Q x with Q = 1 - u g', where u raises the log light by
+        one and g is the derivative of the log mean irradiance (g' u = 1), so that g' Q x = 0.
         """
         state = self.solver.state
         gauge = self.model.adjoint(state.params, self.solver.mean_on_skin(self.albedo, self.irradiance)[2])
@@ -253,7 +255,7 @@ class LightStep:
             costs, changes = zip(*(self._judge(state.params + halving * step) for step in steps), strict=True)
             best = int(np.argmin(costs))
             if costs[best] < self.before:
-                shorter = min(1.0, LARGEST_ROUGHENING / max(abs(changes[best]), 1e-9))
+                shorter = min(1.0, LARGEST_ROUGHNESS_STEP / max(abs(changes[best]), 1e-9))
                 state.params = state.params + shorter * halving * steps[best]
                 break
 

@@ -1,10 +1,10 @@
 """Roughness that varies over the skin, where highlights passed and held-out frames fit better for it.
 
 For a few roughnesses around the clip's one, each point's samples give the curvature and the moment of its specular
-intensity with its albedo eliminated. Summed over a neighbourhood they give a cost per roughness, intensity eliminated
-under its prior, and the parabola through the three lowest values gives the neighbourhood's roughness. Where no
-highlight passed the prior wins: the clip's roughness. Neighbourhoods and not face segments, since segments would leave
-their borders in the map.
+intensity with its albedo projected out. Summed over a neighbourhood they give a cost per roughness, intensity
+eliminated under its prior, and the parabola through the three lowest values gives the neighbourhood's roughness. Where
+no highlight passed the prior wins: the clip's roughness. Neighbourhoods and not face segments, since segments would
+leave their borders in the map.
 
 The light was solved for one roughness and has taken up part of what another one would explain, so that all
 neighbourhoods lean to the same side: only their differences count, the mean stays the clip's.
@@ -31,8 +31,9 @@ WORTHWHILE = 0.002
 
 
 @dataclass(frozen=True)
-class GlossEquations:
-    """Evidence on gloss of P points at R roughnesses: curvature and moment [R, P] of the specular intensity.
+class SpecularEquations:
+    """Evidence on the specular terms of P points at R roughnesses: curvature and moment [R, P] of the specular
+    intensity.
 
     positions [P, 3] mm; logs [R]: log roughness, the clip's in the middle; specular: mean and precision of the
     intensity; shift: what log roughness is off by in the mean, to be taken away.
@@ -55,7 +56,7 @@ class GlossEquations:
         curvature, moment = self._pooled(positions)
         return (moment / curvature)[:, STEPS]
 
-    def centred(self) -> GlossEquations:
+    def centred(self) -> SpecularEquations:
         """The same with the shift that keeps the points' mean."""
         offset, informed = self._offsets(*self._pooled(self.positions))
         return replace(self, shift=float(offset.sum() / max(informed.sum(), 1e-12)))
@@ -81,7 +82,7 @@ class GlossEquations:
         return offset, np.clip(1.0 - np.square(step / SPREAD) / bend, 0.0, 1.0)
 
 
-def local_roughness(solver: AppearanceSolver) -> tuple[GlossEquations | None, dict]:
+def local_roughness(solver: AppearanceSolver) -> tuple[SpecularEquations | None, dict]:
     """What the samples say of the roughness around each point under the state of a solver that is baked, and a record;
     None instead where one value serves as well."""
     state = solver.state
@@ -89,15 +90,15 @@ def local_roughness(solver: AppearanceSolver) -> tuple[GlossEquations | None, di
     irradiance, reflection = solver.forward(state.light)
     model = solver.model(irradiance, reflection)
     weight = solver.weights(model)
-    solver.measure_misfit(model, weight)
-    equations = gloss_equations(solver, irradiance, weight * solver.fitted)
+    solver.measure_reduced_chi_square(model, weight)
+    equations = specular_equations_of(solver, irradiance, weight * solver.fitted)
     specular = torch.from_numpy(equations.specular_at(equations.positions).astype(np.float32))[None, :, None]
     local = np.maximum(equations.roughness(equations.positions), solver.table.narrowest)
     errors = {}
     for name, tried in (("one", state.roughness), ("local", local)):
         solver.bake_lobes(tried)
         shown = solver.forward(state.light)[1] * specular
-        albedo = solver.eliminate(irradiance, shown, weight)
+        albedo = solver.best_albedo(irradiance, shown, weight)
         held_out = weight * (1.0 - solver.fitted)
         squared = held_out * (albedo * irradiance + shown - solver.colours).square()
         errors[name] = float((squared.sum() / held_out.sum().clamp_min(1e-9)).sqrt())
@@ -112,17 +113,18 @@ def local_roughness(solver: AppearanceSolver) -> tuple[GlossEquations | None, di
     return (equations if kept else None), record
 
 
-def gloss_equations(solver: AppearanceSolver, irradiance: torch.Tensor, weight: torch.Tensor) -> GlossEquations:
-    """The equations under fixed light, albedo eliminated; weight [3, P, F] of the samples that take part."""
+def specular_equations_of(solver: AppearanceSolver, irradiance: torch.Tensor,
+                          weight: torch.Tensor) -> SpecularEquations:
+    """The equations under fixed light, albedo projected out; weight [3, P, F] of the samples that take part."""
     state, (mean, spread) = solver.state, solver.settings.specular_prior
     logs = np.log(state.roughness) + np.log(FACTOR) * np.arange(-STEPS, STEPS + 1)
     evidence, sums = solver.evidence(weight), []
     for log in logs:
         solver.bake_lobes(float(np.exp(log)))
         reflection = solver.forward(state.light)[1]
-        pure = solver.off_albedo(reflection, irradiance, weight)
+        pure = solver.project_off_albedo(reflection, irradiance, weight)
         sums.append([(weight * pure * seen).sum((0, 2)).double().numpy() for seen in (reflection, solver.colours)])
     curvature, moment = evidence * np.moveaxis(np.array(sums), 1, 0)
     positions = np.asarray(solver.capture.points.positions, np.float64)
     precision = (mean * spread) ** -2
-    return GlossEquations(positions, logs, curvature, moment, (state.specular, precision)).centred()
+    return SpecularEquations(positions, logs, curvature, moment, (state.specular, precision)).centred()

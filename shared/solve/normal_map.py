@@ -60,7 +60,8 @@ def uv_tangents(mesh: Mesh, normals: np.ndarray, face: np.ndarray, bary: np.ndar
 
 @dataclass(frozen=True)
 class ReliefEquations:
-    """Per texel, albedo eliminated: hessian [T, 3] (k1 k1, k1 k2, k2 k2) and gradient [T, 2] of the cost of a turn."""
+    """Per texel, albedo projected out: hessian [T, 3] (k1 k1, k1 k2, k2 k2) and gradient [T, 2] of the cost of a
+    turn."""
 
     hessian: np.ndarray
     gradient: np.ndarray
@@ -103,11 +104,13 @@ class ReliefSums:
 
     def add(self, samples: LinearSamples, residual: np.ndarray) -> None:
         """Samples with the residuals [n, 3] to explain."""
-        seen = samples.rows, samples.irradiance, samples.derivative, residual, samples.weight
-        _add_products(*seen, self.per_channel, self.together)
+        _add_products(
+            samples.rows, samples.irradiance, samples.derivative, residual, samples.weight, self.per_channel,
+            self.together
+        )
 
     def equations(self) -> ReliefEquations:
-        """With the albedo eliminated."""
+        """With the albedo projected out."""
         ee, e1, e2, er = (self.per_channel[:, 3 * k : 3 * k + 3] for k in range(4))
         ee = np.maximum(ee, 1e-6)
         products = [(left * right / ee).sum(1) for left, right in ((e1, e1), (e1, e2), (e2, e2), (e1, er), (e2, er))]

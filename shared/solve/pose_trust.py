@@ -1,4 +1,4 @@
-"""How far the poses can be trusted: the last adjustment with its measured noise, its covariance, and the focal length.
+"""The poses' uncertainty: the last adjustment with its measured noise, its covariance, and the focal length.
 
 Errors of neighbouring tracks go along with each other, so that counting tracks flatters the poses. Two halves of the
 face, in patches like a chessboard, are solved for themselves: how far they disagree, against what their own covariances
@@ -41,7 +41,7 @@ CHI_SQUARED_MEDIAN_3 = 2.366
 
 
 @dataclass(frozen=True)
-class TrustedPoses:
+class EstimatedPoses:
     """The last solution of the reliable frames: covariance [F, 6, 6] (NaN elsewhere), noise_factor, the lens's check.
 
     focal_gain and focal_deviation: solved over given, had it been left free, and the logarithm's standard deviation;
@@ -74,7 +74,7 @@ def noise_factor(
         shown = np.minimum(tracks.seen[:, odd].sum(1), tracks.seen[:, ~odd].sum(1)) >= LEAST_HALF
         if shown.sum() < 3:
             continue
-        halves = [
+        first, second = [
             adjust(
                 tracks.subset(shown, half),
                 solution.camera_from_points[shown],
@@ -85,7 +85,7 @@ def noise_factor(
             ).camera_from_points[:, :3, :3]
             for half in (odd, ~odd)
         ]
-        apart = rotations_apart(*halves)
+        apart = rotations_apart(first, second)
         distance = np.einsum("fi,fi->f", apart, np.linalg.solve(4.0 * covariance[shown], apart[..., None])[..., 0])
         ratios.append(float(np.sqrt(np.median(distance) / CHI_SQUARED_MEDIAN_3)))
     return max(ratios)
@@ -118,13 +118,13 @@ def focal_elsewhere(clip: TrackedClip, flow: Adjusted) -> tuple[float, float] | 
     return None if deviations < FOCAL_DEVIATIONS else (other.gain, float(abs(np.log(other.gain)) / deviations))
 
 
-def trust(
+def estimate_uncertainty(
     clip: TrackedClip,
     last: Adjusted,
     prior_mm: float,
     estimate_focal: bool,
     elsewhere: tuple[float, float] | None = None,
-) -> TrustedPoses:
+) -> EstimatedPoses:
     """The last adjustment, with noise as measured and the motion prior, and its covariance.
 
     estimate_focal: the focal length is a guess, so that the solved one is taken over where the clip determines it.
@@ -170,4 +170,4 @@ def trust(
     residuals = np.full(solution.residuals_px.shape, np.nan)
     residuals[shown] = solved.residuals_px
     final = Adjusted(BundleSolution(every, solved.points, residuals, solved.focal_gain), last.tracks, shown)
-    return TrustedPoses(final, covariance, factor, free.focal_gain, uncertain.log_focal, solve_focal, held_off)
+    return EstimatedPoses(final, covariance, factor, free.focal_gain, uncertain.log_focal, solve_focal, held_off)

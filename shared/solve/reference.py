@@ -28,7 +28,7 @@ from shared.raycast import RayScene
 from shared.solve.light_models import make_light_model
 from shared.solve.reference_raster import Hits, Raster, blend, torch_vertex_normals
 from shared.solve.reference_settings import ReferenceSettings
-from shared.solve.reference_shade import Shader, Texture
+from shared.solve.reference_shade import Shader, TorchMaterial
 from shared.solve.reference_shape import LaplacianLoss, LargeSteps
 
 MASK_REACH_PX = 8.0
@@ -110,14 +110,14 @@ class ReferenceSolver:
         """[V, 3] mm."""
         return self.steps.vertices(self.parameters["vertices"])
 
-    def texture(self, uv: torch.Tensor) -> Texture:
+    def texture(self, uv: torch.Tensor) -> TorchMaterial:
         """The maps at [P, 2] texture coordinates, bilinear."""
         maps = self.parameters
         stacked = torch.cat([maps["albedo"], maps["specular"][..., None], maps["roughness"][..., None]], dim=-1)
         place = torch.stack([2.0 * uv[:, 0] - 1.0, 1.0 - 2.0 * uv[:, 1]], dim=-1)[None, None]
         source = stacked.permute(2, 0, 1)[None]
         found = torch.nn.functional.grid_sample(source, place, padding_mode="border", align_corners=False)[0, :, 0].T
-        return Texture(found[:, :3], found[:, 3], found[:, 4].clamp(LEAST_ROUGHNESS, 1.0))
+        return TorchMaterial(found[:, :3], found[:, 3], found[:, 4].clamp(LEAST_ROUGHNESS, 1.0))
 
     def geometry(self) -> tuple[torch.Tensor, torch.Tensor, RayScene]:
         """Vertices and normals [V, 3] of the present parameters, and the scene for rays; made once where they rest."""
@@ -200,11 +200,11 @@ class ReferenceSolver:
         drawn[visible] = True
         near_by = np.nonzero(drawn[pairs.near] | drawn[pairs.far])[0]
         pixels = np.unique(np.concatenate([visible, pairs.near[near_by], pairs.far[near_by]]))
-        rows = [
+        near, far = [
             torch.from_numpy(np.searchsorted(pixels, side[near_by])).to(self.device) for side in (pairs.near, pairs.far)
         ]
         found = self.shade(pose, pixels, hits, geometry, generator)
-        found = blend(found, *rows, crossing[torch.from_numpy(near_by).to(self.device)])
+        found = blend(found, near, far, crossing[torch.from_numpy(near_by).to(self.device)])
         found = found[torch.from_numpy(np.searchsorted(pixels, visible)).to(self.device)]
         image = (found - self._tensor(colours[visible])).abs().mean()
         return {"image": image, "mask": self._mask_loss(hits, pairs, crossing, person, near_border)}

@@ -13,8 +13,8 @@ import torch
 from shared.errors import InputError
 from shared.gather import SurfaceViewer
 from shared.io.arrays import load_arrays, save_arrays
-from shared.solve.appearance import State
-from shared.solve.capture import set_scenery, spread_frames
+from shared.solve.appearance import AppearanceState
+from shared.solve.capture import precompute_transfer, spread_frames
 from shared.solve.chart_scale import describe_scale
 from shared.solve.fit_appearance import Solution
 from shared.solve.inverse_problem import FACE_SKIN, InverseResult, InverseSettings, segment_vertices, shade_vertices
@@ -55,7 +55,7 @@ def average_texture(inputs, viewer: SurfaceViewer, size: int, frames: np.ndarray
         weight[samples.rows] += samples.weight
     seen = weight > 1e-3
     if not seen.any():
-        raise InputError("no frame shows the mesh", where="poses", mend="check the poses and the mesh")
+        raise InputError("no frame shows the mesh", where="poses", hint="check the poses and the mesh")
     colours = np.where(
         seen[:, None], total / np.maximum(weight, 1e-9)[:, None], np.median(total[seen] / weight[seen, None], axis=0)
     )
@@ -73,8 +73,8 @@ def make_start(average: Average, skin: np.ndarray, white_sigma: float, specular:
     irradiance = np.exp(most_likely_irradiance(np.log(radiance), white_sigma))
     albedo = np.clip(average.colours / irradiance, 0.0, 1.0)
     grey = albedo.mean(1) if specular else np.zeros(len(albedo))
-    maps = (surface.dilated(surface.to_image(values.astype(np.float32))) for values in (albedo, grey))
-    return Start(irradiance, *maps)
+    albedo, grey = (surface.dilated(surface.to_image(values.astype(np.float32))) for values in (albedo, grey))
+    return Start(irradiance, albedo, grey)
 
 
 def solve_by_reference(
@@ -166,12 +166,12 @@ def conclude(inputs, settings, solver: ReferenceSolver, average: Average, fitted
     maps = make_maps(surface, material, roughness)
     maps["roughness"] = roughness_map.astype(np.float32)
     appearance = replace(settings.appearance, bounce=False, visibility=solver.settings.sampling.visibility)
-    scenery = set_scenery(viewer, settings.sizes, appearance.visibility)
-    state = final_state(solver, material, roughness, len(scenery.nodes.points))
+    precomputed = precompute_transfer(viewer, settings.sizes, appearance.visibility)
+    state = final_state(solver, material, roughness, len(precomputed.nodes.points))
     fit = residual(inputs, solver, np.nonzero(fitted)[0])
     held = fit if fitted.all() else residual(inputs, solver, np.nonzero(~fitted)[0])
     solution = Solution(state, tuple(_thinned(records)), fit, held)
-    shading = shade_vertices(inputs, appearance, viewer, scenery, solution, progress)
+    shading = shade_vertices(inputs, appearance, viewer, precomputed, solution, progress)
     record = {
         "texture": {"held_out": {"per texel": held}, "chosen": "per texel"},
         "albedo_scale": describe_scale(None, np.median(state.albedo, axis=0)) | {"method": SCALE},
@@ -188,7 +188,7 @@ def map_material(solver: ReferenceSolver, average: Average) -> TexelMaterial:
     return TexelMaterial(albedo, specular, average.weight / SAMPLE_SPREAD**2)
 
 
-def final_state(solver: ReferenceSolver, material: TexelMaterial, roughness: float, nodes: int) -> State:
+def final_state(solver: ReferenceSolver, material: TexelMaterial, roughness: float, nodes: int) -> AppearanceState:
     """The light, made coarse enough for the transfer's renderer, and typical material."""
     light = solver.light().detach().cpu().double().numpy()
     edge = round((len(light) / 6) ** 0.5)
@@ -198,7 +198,7 @@ def final_state(solver: ReferenceSolver, material: TexelMaterial, roughness: flo
     specular = float(np.median(material.specular))
     typical = np.median(material.albedo[material.information > 1.0], axis=0)
     params = np.log(np.maximum(light, 1e-6))
-    return State(params, LogLight(edge), specular, roughness, material.albedo, np.tile(typical, (nodes, 1)))
+    return AppearanceState(params, LogLight(edge), specular, roughness, material.albedo, np.tile(typical, (nodes, 1)))
 
 
 @torch.no_grad()

@@ -39,7 +39,7 @@ class Sampling:
 
 
 @dataclass(frozen=True)
-class Texture:
+class TorchMaterial:
     """What the surface is made of at P pixels: albedo [P, 3], specular_intensity [P], roughness [P]."""
 
     albedo: torch.Tensor
@@ -70,7 +70,7 @@ class Shader:
         self,
         light: torch.Tensor,
         points: SurfacePoints,
-        texture: Texture,
+        texture: TorchMaterial,
         scene: RayScene,
         world_from_head: np.ndarray,
         generator: torch.Generator,

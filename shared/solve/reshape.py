@@ -9,11 +9,11 @@ from scipy.spatial import cKDTree
 
 from shared.intersections import move_without_crossing
 from shared.mesh import Mesh, subdivide
-from shared.solve.appearance import Settings
+from shared.solve.appearance import AppearanceSettings
 from shared.solve.capture import Sizes, lens_of_frames
 from shared.solve.shape import HELD, SHAPED, Reflectance, ShapeClip, ShapeSettings, ShapeSolver, Traced
 from shared.solve.shape_step import TrackPoints
-from shared.solve.silhouette import Outlines, RimSettings, fit_outline, mask_distance
+from shared.solve.silhouette import ContourSettings, Outlines, fit_outline, mask_distance
 
 OUTLINED = ("forehead", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "lips", "chin", "jaw", "ears", "scalp")
 """Segments that may form the outline. The neck bends, and clothes cover it."""
@@ -25,7 +25,7 @@ TRACK_FLOOR_MM = 0.1
 """Error of a track point that more frames or sharper pictures do not lessen."""
 
 
-class Reshaped:
+class RefinedInputs:
     """A clip's inputs with another mesh in the place of theirs; traced: what was looked up to refine it; stopped:
     vertices that moved less than wanted, since the surface would have cut itself."""
 
@@ -69,7 +69,7 @@ def surface_error(tracks: tuple[np.ndarray, np.ndarray] | None) -> float:
     return float(1.0 / np.hypot(1.0 / np.median(track_points(*tracks).sigma_mm), 1.0 / MODEL_ERROR_MM))
 
 
-def meet_outline(inputs, frames: tuple[np.ndarray, np.ndarray], settings: RimSettings, note: Callable):
+def meet_outline(inputs, frames: tuple[np.ndarray, np.ndarray], settings: ContourSettings, note: Callable):
     """The inputs with their mesh moved to meet the person masks' borders where no track lies, and a record; frames:
     which, and which of them are fitted."""
     chosen, fitted = frames
@@ -86,20 +86,20 @@ def meet_outline(inputs, frames: tuple[np.ndarray, np.ndarray], settings: RimSet
         known = cKDTree(inputs.tracks[0]).query(vertices)[0] < TRACK_REACH_MM
     mesh, record = fit_outline(inputs.mesh, faces_of(inputs, OUTLINED), known, outlines, settings, note)
     placed = move_without_crossing(vertices, mesh.vertices, mesh.faces)
-    return Reshaped(inputs, mesh.replace(vertices=placed)), record
+    return RefinedInputs(inputs, mesh.replace(vertices=placed)), record
 
 
-def reshape(
+def refine_shape(
     inputs,
     frames: tuple[np.ndarray, np.ndarray],
     reflectance: Reflectance,
-    appearance: Settings,
+    appearance: AppearanceSettings,
     sizes: Sizes,
     settings: ShapeSettings,
     progress: Callable,
     note: Callable,
-    begun: Reshaped | None = None,
-) -> Reshaped:
+    begun: RefinedInputs | None = None,
+) -> RefinedInputs:
     """The inputs with their mesh refined under a known light; frames: which, and which of them are fitted; begun: the
     same with fewer subdivisions, from where this goes on."""
     chosen, fitted = frames
@@ -122,4 +122,4 @@ def reshape(
     stopped = int((np.abs(placed - refined.vertices).max(1) > 1e-6).sum())
     if stopped:
         note(f"shape: {stopped} vertices moved less than wanted, so that the surface does not cut itself")
-    return Reshaped(inputs, refined.replace(vertices=placed), traced and traced.kept(), stopped)
+    return RefinedInputs(inputs, refined.replace(vertices=placed), traced and traced.kept(), stopped)

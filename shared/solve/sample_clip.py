@@ -24,7 +24,7 @@ MASKS_IN_SURVEY = 30
 MIN_FRAMES, FEW_FRAMES = 3, 30
 SMALL_FACE_PX = 200
 DRIFT_WARNING = 0.1
-MEND_FILM = (
+HINT_FILM = (
     "film one face that fills at least a third of the picture's height, turning slowly from side to side for 5 to 20 "
     "seconds in steady light"
 )
@@ -82,7 +82,7 @@ def select_frames(survey: ClipSurvey, info: VideoInfo, where: str, *, frame_coun
     reasons, sharpness = survey.verdicts(blurred_below)
     usable = np.array([i for i, reason in enumerate(reasons) if not reason], int)
     if len(usable) < MIN_FRAMES:
-        raise InputError("too few usable frames", where=where, expected=f"{MIN_FRAMES} or more", mend=MEND_FILM,
+        raise InputError("too few usable frames", where=where, expected=f"{MIN_FRAMES} or more", hint=HINT_FILM,
                          got=f"{len(usable)} of {survey.count}" + f" ({tally(reasons)})" * any(reasons))
     kept = usable[spread_evenly(np.array(survey.time_s)[usable], sharpness[usable], frame_count)]
     analysed = analysis_size(info)
@@ -109,12 +109,12 @@ def upright_face(survey: ClipSurvey, where: str) -> FaceTrack:
     face = survey.main_face
     if face is None:
         raise InputError("no face found in the clip", where=where, got=f"{survey.count} frames looked at",
-                         expected="a face that looks towards the camera, the right way up", mend=MEND_FILM)
+                         expected="a face that looks towards the camera, the right way up", hint=HINT_FILM)
     turns = survey.quarter_turns()
     if turns:
         transpose = {1: "transpose=2", 2: "hflip,vflip", 3: "transpose=1"}[turns]
         raise InputError("the head is upside down" if turns == 2 else "the head lies on its side", where=where,
-                         expected="an upright head", mend=f"ffmpeg -i IN -vf {transpose} -c:v libx264 -crf 12 OUT.mp4")
+                         expected="an upright head", hint=f"ffmpeg -i IN -vf {transpose} -c:v libx264 -crf 12 OUT.mp4")
     return face
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from shared.gather import Samples, satisfied
+from shared.gather import Samples, is_inactive
 
 CAUCHY = 6.0
 """Squared errors of so many times their spread get half the weight of small ones."""
@@ -37,30 +37,31 @@ class SampleErrors:
         independent: float,
     ):
         self.colours = channel_first(samples.colours)
-        self.limits = channel_first(samples.limits)
+        self.saturation = channel_first(samples.saturation)
         self.trust = torch.from_numpy(samples.weight)[None]
         sigma = noise[0] + noise[1] * self.colours
         self.precision = 1.0 / (sigma * sigma)
         self.fitted = torch.from_numpy(fitted.astype(np.float32))
         self.light_frames, self.independent = light_frames, independent
-        self.reliability, self.misfit = torch.ones(1, 1, 1), 1.0
+        self.reliability, self.reduced_chi_square = torch.ones(1, 1, 1), 1.0
 
     def weights(self, model: torch.Tensor | None) -> torch.Tensor:
-        """[3, P, F] inverse variances: trust, robust loss, and zero where a censored sample is satisfied."""
+        """[3, P, F] inverse variances: trust, robust loss, and zero where a censored sample 's bound is inactive."""
         weight = self.trust * self.precision
         if model is None:
-            return weight * (self.limits == 0)
-        error, silent = self.errors(model)
-        return weight * (~silent) / (1.0 + error / (CAUCHY * self.spread(error, silent)))
+            return weight * (self.saturation == 0)
+        error, inactive = self.errors(model)
+        return weight * (~inactive) / (1.0 + error / (CAUCHY * self.spread(error, inactive)))
 
     def errors(self, model: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Squared errors over the assumed noise's variance, and where a censored sample is satisfied; [3, P, F]."""
+        """Squared errors over the assumed noise's variance, and where a censored sample 's bound is inactive; [3, P,
+        F]."""
         error = model - self.colours
-        return error.square() * self.precision, satisfied(self.limits, error)
+        return error.square() * self.precision, is_inactive(self.saturation, error)
 
-    def spread(self, error: torch.Tensor, silent: torch.Tensor, frames: slice | np.ndarray = slice(None)) -> float:
+    def spread(self, error: torch.Tensor, inactive: torch.Tensor, frames: slice | np.ndarray = slice(None)) -> float:
         """Variance of the errors over the assumed noise's, by their median, in all frames or in some."""
-        used = ((self.trust > 0) & ~silent)[..., frames]
+        used = ((self.trust > 0) & ~inactive)[..., frames]
         return max(float(error[..., frames][used].median()), 0.05) / 0.4549
 
     def weigh(self, reliability: torch.Tensor) -> None:
@@ -73,23 +74,23 @@ class SampleErrors:
 
         What the steps lower: unlike a mean square it does not rise when many samples fit better and a few worse.
         """
-        error, silent = self.errors(model)
-        spread = self.spread(error, silent) if spread is None else spread
+        error, inactive = self.errors(model)
+        spread = self.spread(error, inactive) if spread is None else spread
         weight = self.trust * self.fitted
-        loss = torch.log1p(error * (~silent) / (CAUCHY * spread))
+        loss = torch.log1p(error * (~inactive) / (CAUCHY * spread))
         return float((weight * loss).sum() / (3.0 * weight.sum())), spread
 
     def evidence(self, weight: torch.Tensor) -> float:
         """Scales the data term so that each light's samples count as independent ones of the variance found."""
         count = float((weight * self.fitted > 0).sum()) / 3.0
-        return len(self.light_frames) * self.independent / (max(count, 1.0) * self.misfit)
+        return len(self.light_frames) * self.independent / (max(count, 1.0) * self.reduced_chi_square)
 
-    def measure_misfit(self, model: torch.Tensor, weight: torch.Tensor) -> None:
+    def measure_reduced_chi_square(self, model: torch.Tensor, weight: torch.Tensor) -> None:
         """Variance of the residuals over the assumed noise's, at least 1: where the model cannot follow the clip, the
         samples say that much less against the priors."""
         used = weight * self.fitted
         squared = float((used * (model - self.colours).square()).sum()) / max(float((used > 0).sum()), 1.0)
-        self.misfit = max(1.0, squared)
+        self.reduced_chi_square = max(1.0, squared)
 
     def residuals(self, model: torch.Tensor) -> tuple[float, float]:
         """Root mean square residual (linear, trust-weighted, censored) on fitted and on held-out frames, of the mean

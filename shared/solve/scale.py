@@ -114,7 +114,7 @@ def most_likely_irradiance(log_radiance: np.ndarray, white_sigma: float = WHITE_
     return np.linalg.lstsq(matrix, right, rcond=None)[0]
 
 
-def settle_scale(
+def resolve_scale(
     log_albedo: np.ndarray,
     log_irradiance: np.ndarray,
     highlights: Highlights | None,

@@ -17,12 +17,12 @@ from shared.gather import SurfaceViewer
 from shared.mesh import Mesh, subdivide, vertex_normals
 from shared.read_ahead import read_ahead
 from shared.shading import DEEP, Material, VertexShading
-from shared.solve.appearance import Settings
-from shared.solve.capture import Scenery, Sizes, face_front, set_scenery
+from shared.solve.appearance import AppearanceSettings
+from shared.solve.capture import PrecomputedTransfer, Sizes, face_front, precompute_transfer
 from shared.solve.fit_appearance import Solution
-from shared.solve.local_roughness import GlossEquations
+from shared.solve.local_roughness import SpecularEquations
 from shared.solve.shape_equations import EquationSettings, PointEquations, point_equations
-from shared.solve.shape_samples import SurfaceView, gather_surface, look_at_surface
+from shared.solve.shape_samples import SurfaceView, look_at_surface, sample_surface
 from shared.solve.shape_step import (
     LARGEST_STEP_EDGES,
     TrackPoints,
@@ -33,7 +33,7 @@ from shared.solve.shape_step import (
     track_rows,
 )
 from shared.solve.shape_terms import Reflections, shading_terms
-from shared.solve.silhouette import RimSettings
+from shared.solve.silhouette import ContourSettings
 from shared.transfer import Nodes, Points, Transfer, mesh_points, nearest_points
 
 SHAPED = ("forehead", "brows", "lids", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "lips", "chin", "jaw")
@@ -47,9 +47,9 @@ BLUR_EDGES = 0.4
 @dataclass(frozen=True)
 class ShapeSettings:
     """subdivisions: finer levels beyond the given mesh; rounds: most steps per level; frames: that the shape is solved
-    from; smoothness: lambda of the large steps; sigma_mm: how far the surface may be from the start as a whole; rim:
-    how the outline is met first, None: it is not; looks_back: the last step of a level is judged, too, and not only the
-    mesh by whoever asked for it."""
+    from; smoothness: lambda of the large steps; sigma_mm: how far the surface may be from the start as a whole;
+    contour: how the outline is met first, None: it is not; looks_back: the last step of a level is judged, too, and not
+    only the mesh by whoever asked for it."""
 
     subdivisions: int = 1
     rounds: int = 2
@@ -57,30 +57,33 @@ class ShapeSettings:
     smoothness: float = 19.0
     sigma_mm: float = 8.0
     equations: EquationSettings = field(default_factory=EquationSettings)
-    rim: RimSettings | None = field(default_factory=RimSettings)
+    contour: ContourSettings | None = field(default_factory=ContourSettings)
     looks_back: bool = True
 
 
 @dataclass(frozen=True)
 class Reflectance:
     """What the shape is solved under: light [6 n^2, 3], specular intensity, roughness and how it varies; nodes with
-    their albedo [K, 3]: where light bounced when it was solved; light_trust: of several lights, which lie one below the
-    other, how much samples of each count."""
+    their albedo [K, 3]: where light bounced when it was solved; light_weights: of several lights, which lie one below
+    the other, how much samples of each count."""
 
     light: np.ndarray
     specular: float
     roughness: float
     nodes: Nodes
     node_albedo: np.ndarray
-    gloss: GlossEquations | None = None
-    light_trust: tuple[float, ...] = ()
+    local_roughness_fit: SpecularEquations | None = None
+    light_weights: tuple[float, ...] = ()
 
     @staticmethod
-    def of(solution: Solution, scenery: Scenery) -> Reflectance:
+    def of(solution: Solution, precomputed: PrecomputedTransfer) -> Reflectance:
         """That of a solved appearance."""
         state = solution.state
-        known = state.light, state.specular, state.roughness, scenery.nodes, state.node_albedo
-        return Reflectance(*known, solution.gloss, solution.light_trust)
+        return Reflectance(
+            light=state.light, specular=state.specular, roughness=state.roughness, nodes=precomputed.nodes,
+            node_albedo=state.node_albedo, local_roughness_fit=solution.local_roughness_fit,
+            light_weights=solution.light_weights,
+        )
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,7 @@ next more than makes up for it. The best of all stays."""
 
 
 @dataclass(frozen=True)
-class Surface:
+class ShapedSurface:
     """A mesh, the vertices index [P] that are shaped, and their equations."""
 
     mesh: Mesh
@@ -117,7 +120,7 @@ class Traced:
     """What is looked up once per level, since steps move the surface by far less than what it sees is away: the
     points of vertices index [P] and their transfer, how the frames see them, and what they reflect (None: nothing)."""
 
-    scenery: Scenery
+    precomputed: PrecomputedTransfer
     index: np.ndarray
     points: Points
     transfer: Transfer
@@ -130,7 +133,7 @@ class Traced:
 
     def turned_to(self, normals: np.ndarray) -> Transfer:
         """The transfer for other normals [P, 3] under the same visibility."""
-        cosine = np.maximum(normals @ self.scenery.directions.T, 0.0) * (4.0 / len(self.scenery.directions))
+        cosine = np.maximum(normals @ self.precomputed.directions.T, 0.0) * (4.0 / len(self.precomputed.directions))
         return replace(self.transfer, direct=(cosine * self.transfer.visibility()).astype(np.float16))
 
 
@@ -141,7 +144,7 @@ class ShapeSolver:
         self,
         clip: ShapeClip,
         reflectance: Reflectance,
-        appearance: Settings,
+        appearance: AppearanceSettings,
         sizes: Sizes,
         settings: ShapeSettings,
         progress: Callable = lambda items, label: items,
@@ -161,26 +164,26 @@ class ShapeSolver:
         index = np.nonzero(wanted & face_front(viewer, clip.camera_from_head, 0.2))[0]
         points = mesh_points(mesh, index)
         if before is None:
-            scenery = set_scenery(viewer, self.sizes, self.appearance.visibility)
-            transfer = scenery.trace(points)
+            precomputed = precompute_transfer(viewer, self.sizes, self.appearance.visibility)
+            transfer = precomputed.trace(points)
         else:
-            scenery, transfer = before.scenery, before.transfer.take(nearest_points(points, before.points))
+            precomputed, transfer = before.precomputed, before.transfer.take(nearest_points(points, before.points))
         blur = BLUR_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
         pictures = read_ahead(map(clip.picture, self.progress(range(len(clip.camera_from_head)), "shape, sampling")))
         views = look_at_surface(viewer, index, pictures, clip.camera_from_head, clip.intrinsics, blur)
-        traced = Traced(scenery, index, points, transfer, views, None)
+        traced = Traced(precomputed, index, points, transfer, views, None)
         if not self.appearance.specular or len(index) < FEWEST_POINTS:
             return traced
         shading = self._shade(mesh, traced, points, traced.turned_to(points.normals))
         return replace(traced, reflections=Reflections(shading, np.arange(len(index))))
 
-    def examine(self, mesh: Mesh, shaped: np.ndarray, traced: Traced) -> Surface | None:
+    def examine(self, mesh: Mesh, shaped: np.ndarray, traced: Traced) -> ShapedSurface | None:
         """Samples, shading and equations of the traced vertices; None where hardly any is seen."""
         clip, settings, index = self.clip, self.settings, traced.index
         points = mesh_points(mesh, index)
-        samples = gather_surface(points.positions, traced.views, clip.camera_from_head, clip.intrinsics)
-        if self.reflectance.light_trust:
-            samples.weight[:] *= np.array(self.reflectance.light_trust, np.float32)[clip.light_index]
+        samples = sample_surface(points.positions, traced.views, clip.camera_from_head, clip.intrinsics)
+        if self.reflectance.light_weights:
+            samples.weight[:] *= np.array(self.reflectance.light_weights, np.float32)[clip.light_index]
         transfer = traced.turned_to(points.normals)
         seen = (samples.weight[:, clip.fitted] > 0).sum(1) >= min(MINIMUM_FRAMES, int(clip.fitted.sum()))
         rows = np.nonzero(seen & (transfer.blocked < DEEP))[0]
@@ -199,28 +202,28 @@ class ShapeSolver:
             clip.fitted,
             settings.equations,
         )
-        return Surface(mesh, index[rows], terms.tangents, equations)
+        return ShapedSurface(mesh, index[rows], terms.tangents, equations)
 
     def _shade(self, mesh, traced: Traced, points, transfer) -> VertexShading:
-        known, scenery = self.reflectance, traced.scenery
-        local = None if known.gloss is None else known.gloss.roughness(points.positions)
-        node_albedo = known.node_albedo[nearest_points(scenery.nodes.points, known.nodes.points)]
+        known, precomputed = self.reflectance, traced.precomputed
+        local = None if known.local_roughness_fit is None else known.local_roughness_fit.roughness(points.positions)
+        node_albedo = known.node_albedo[nearest_points(precomputed.nodes.points, known.nodes.points)]
         return VertexShading(
             traced.index,
             mesh.vertices,
             points,
             transfer,
-            scenery.node_transfer,
+            precomputed.node_transfer,
             Material(node_albedo, known.specular, known.roughness, local),
             known.light,
-            scenery.directions,
+            precomputed.directions,
             self.clip.camera_from_head,
             self.clip.moves,
             bounce=self.appearance.bounce,
             light_index=self.clip.light_index,
         )
 
-    def step(self, surface: Surface, start: np.ndarray, shaped: np.ndarray, held: np.ndarray) -> np.ndarray:
+    def step(self, surface: ShapedSurface, start: np.ndarray, shaped: np.ndarray, held: np.ndarray) -> np.ndarray:
         """Offsets [V] along the normals."""
         mesh, count = surface.mesh, len(surface.mesh.vertices)
         normals = vertex_normals(mesh.vertices, mesh.faces)
@@ -287,5 +290,5 @@ def typical_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)))
 
 
-def _residuals(surface: Surface) -> str:
+def _residuals(surface: ShapedSurface) -> str:
     return f"residual {surface.equations.fitted:.5f} fitted, {surface.equations.held_out:.5f} held out"

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
-from shared.gather import satisfied
+from shared.gather import is_inactive
 from shared.solve.depth_noise import PATCH_MM
 from shared.solve.shape_samples import SurfaceSamples
 from shared.solve.shape_terms import ShadingTerms
@@ -92,10 +92,10 @@ def point_equations(
 ) -> PointEquations:
     """Equations of P points [P, 3] with normals [P, 3]; specular: intensity, one or [P]; fitted [F] bool."""
     specular = np.broadcast_to(np.asarray(specular, np.float32), (len(points),))[:, None, None]
-    gloss = specular * terms.reflection
-    doubt = settings.shadow_mm * terms.shadow_slope
-    albedo, weight = _fit_albedo(samples, terms.irradiance, gloss, fitted, settings.noise, doubt)
-    model = albedo[:, None] * terms.irradiance + gloss
+    highlights = specular * terms.reflection
+    uncertainty = settings.shadow_mm * terms.shadow_slope
+    albedo, weight = _fit_albedo(samples, terms.irradiance, highlights, fitted, settings.noise, uncertainty)
+    model = albedo[:, None] * terms.irradiance + highlights
     error = model - samples.colours
     rms = _rms(error, samples, fitted)
     weight = weight * fitted[:, None]
@@ -114,7 +114,8 @@ def point_equations(
     across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
     null = -np.einsum("pfci,pfi->pfc", samples.gradient.astype(np.float32), across)
     null -= terms.irradiance * ((weighted * null).sum(1) / power)[:, None]
-    evidence = np.float64(1.0 / excess(points, (weight * null * error).sum((1, 2)), (weight * null**2).sum((1, 2))))
+    evidence = np.float64(1.0 / variance_inflation(points, (weight * null * error).sum((1, 2)),
+                                                   (weight * null**2).sum((1, 2))))
     rows = slopes.reshape(len(slopes), -1, 3)
     scaled = rows * (evidence * weight).reshape(len(slopes), -1, 1)
     hessian = np.swapaxes(scaled, 1, 2) @ rows
@@ -122,7 +123,7 @@ def point_equations(
     return PointEquations(hessian.astype(np.float64), gradient.astype(np.float64), albedo, *rms)
 
 
-def excess(points: np.ndarray, slope: np.ndarray, power: np.ndarray, radius_mm: float = PATCH_MM) -> float:
+def variance_inflation(points: np.ndarray, slope: np.ndarray, power: np.ndarray, radius_mm: float = PATCH_MM) -> float:
     """How many times larger the errors of patches are than their samples' noise: at least 1.
 
     points [P, 3]; slope, power [P]: gradient and Hessian of the cost by a quantity that is known to be zero everywhere.
@@ -134,24 +135,24 @@ def excess(points: np.ndarray, slope: np.ndarray, power: np.ndarray, radius_mm: 
     return max(1.0, float(np.median(squared)) / CHI_SQUARED_MEDIAN_1)
 
 
-def _fit_albedo(samples, irradiance, gloss, fitted, noise, doubt) -> tuple[np.ndarray, np.ndarray]:
-    """Albedo [P, 3] of the fitted frames and robust, censored weights [P, F, 3] of all; doubt [P, F, 3]: standard
+def _fit_albedo(samples, irradiance, highlights, fitted, noise, uncertainty) -> tuple[np.ndarray, np.ndarray]:
+    """Albedo [P, 3] of the fitted frames and robust, censored weights [P, F, 3] of all; uncertainty [P, F, 3]: standard
     deviation of the irradiance."""
-    sigma = np.hypot(noise[0] + noise[1] * samples.colours, TYPICAL_ALBEDO * doubt)
+    sigma = np.hypot(noise[0] + noise[1] * samples.colours, TYPICAL_ALBEDO * uncertainty)
     base = samples.weight[..., None] / sigma**2
-    weight = base * (samples.limits == 0)
+    weight = base * (samples.saturation == 0)
     for _ in range(3):
         used = weight * fitted[:, None] * irradiance
-        albedo = (used * (samples.colours - gloss)).sum(1) / np.maximum((used * irradiance).sum(1), 1e-9)
+        albedo = (used * (samples.colours - highlights)).sum(1) / np.maximum((used * irradiance).sum(1), 1e-9)
         albedo = np.clip(albedo, MINIMUM_ALBEDO, MAXIMUM_ALBEDO)
-        error = albedo[:, None] * irradiance + gloss - samples.colours
-        weight = base * ~satisfied(samples.limits, error) / (1.0 + (error / (CAUCHY_SCALE * sigma)) ** 2)
+        error = albedo[:, None] * irradiance + highlights - samples.colours
+        weight = base * ~is_inactive(samples.saturation, error) / (1.0 + (error / (CAUCHY_SCALE * sigma)) ** 2)
     return albedo, weight
 
 
 def _rms(error: np.ndarray, samples: SurfaceSamples, fitted: np.ndarray) -> tuple[float, float]:
     """Trust-weighted rms residual of fitted and of held-out frames."""
-    squared = (np.minimum(error**2, LARGEST_SQUARED_ERROR) * ~satisfied(samples.limits, error)).sum(2)
+    squared = (np.minimum(error**2, LARGEST_SQUARED_ERROR) * ~is_inactive(samples.saturation, error)).sum(2)
     result = []
     for chosen in (fitted, ~fitted):
         weight = samples.weight * chosen

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from shared.gather import Picture, SurfaceViewer, remap, sample_inside, sample_limits
+from shared.gather import Picture, SurfaceViewer, remap, sample_inside, sample_saturation
 from shared.geometry import project, projection_slope
 
 LEAST_BLUR_PX = 0.3
@@ -25,18 +25,18 @@ class SurfaceSamples:
     """P points in F frames.
 
     colours [P, F, 3] linear; gradient [P, F, 3, 2] float16, per pixel; pixels_per_mm [P, F, 2, 3]: derivative of the
-    pixel by the point's place in head space; weight [P, F] (0: not seen); limits int8 [P, F, 3] as in gather.Samples.
+    pixel by the point's place in head space; weight [P, F] (0: not seen); saturation int8 [P, F, 3] as in Samples.
     """
 
     colours: np.ndarray
     gradient: np.ndarray
     pixels_per_mm: np.ndarray
     weight: np.ndarray
-    limits: np.ndarray
+    saturation: np.ndarray
 
     def points(self, index: slice | np.ndarray) -> SurfaceSamples:
         """The samples of some points."""
-        arrays = (self.colours, self.gradient, self.pixels_per_mm, self.weight, self.limits)
+        arrays = (self.colours, self.gradient, self.pixels_per_mm, self.weight, self.saturation)
         return SurfaceSamples(*(array[index] for array in arrays))
 
 
@@ -79,17 +79,17 @@ def look_at_surface(
         image = picture.levels[0]
         if sigma > LEAST_BLUR_PX:
             image = cv2.GaussianBlur(image, (0, 0), sigma)
-        cut = Picture((image[part].astype(np.float16),), picture.limits[part].copy(), picture.inside[part].copy())
+        cut = Picture((image[part].astype(np.float16),), picture.saturation[part].copy(), picture.inside[part].copy())
         views.append(SurfaceView(cut, (int(low[0]), int(low[1])), weight))
     return views
 
 
-def gather_surface(
+def sample_surface(
     positions: np.ndarray, views: list[SurfaceView], camera_from_head: np.ndarray, intrinsics: np.ndarray
 ) -> SurfaceSamples:
     """Samples of P points [P, 3] in F frames [F, 4, 4]; intrinsics [3, 3] or [F, 3, 3]."""
     shape = (len(positions), len(camera_from_head))
-    colours, limits = np.zeros(shape + (3,), np.float32), np.zeros(shape + (3,), np.int8)
+    colours, saturation = np.zeros(shape + (3,), np.float32), np.zeros(shape + (3,), np.int8)
     gradient = np.zeros(shape + (3, 2), np.float16)
     slope, weight = np.zeros(shape + (2, 3), np.float32), np.zeros(shape, np.float32)
     intrinsics = np.broadcast_to(intrinsics, (len(camera_from_head), 3, 3))
@@ -105,6 +105,6 @@ def gather_surface(
         colours[seen, f] = np.maximum(remap(image, pixels), 0.0)
         gradient[seen, f] = np.stack([remap(along_x, pixels), remap(along_y, pixels)], axis=-1)
         slope[seen, f] = projection_slope(points, pose, lens)
-        limits[seen, f] = sample_limits(view.picture.limits, pixels)
+        saturation[seen, f] = sample_saturation(view.picture.saturation, pixels)
         weight[seen, f] = view.weight[seen] * sample_inside(view.picture, pixels)
-    return SurfaceSamples(colours, gradient, slope, weight, limits)
+    return SurfaceSamples(colours, gradient, slope, weight, saturation)

@@ -1,9 +1,9 @@
-"""The head's outline in the frames: rim points of the mesh against the border of the person mask.
+"""The head's outline in the frames: points of the occluding contour of the mesh against the border of the person mask.
 
-A rim point is where an edge of the mesh turns from the camera's side to the far side. It counts where nothing of the
-mesh lies beyond it and the mask's border is near: there the outline has to touch the border. To first order the outline
-moves as the rim point does along the surface's normal, which lies in the picture's plane: sliding of the rim over the
-surface changes nothing ([Cipolla2000], chapter 4).
+A point of the occluding contour is where an edge of the mesh turns from the camera's side to the far side. It counts
+where nothing of the mesh lies beyond it and the mask's border is near: there the outline has to touch the border. To
+first order the outline moves as the point of the contour does along the surface's normal, which lies in the picture's
+plane: sliding of the contour over the surface changes nothing ([Cipolla2000], chapter 4).
 
 The unknown is a displacement of the vertices of the mesh before its last subdivision, smooth as large steps are, so
 that ears and skull, which no track and little shading reaches, move as a whole.
@@ -35,10 +35,10 @@ BEYOND_PX = 2.5
 
 
 @dataclass(frozen=True)
-class RimSettings:
+class ContourSettings:
     """sigma_px: what a mask's border is good for; reach_mm: borders farther away are something else's; correlated:
-    how many rim points count as one; frames: looked at; rounds: most steps; smoothness, sigma_mm: as of the shape;
-    known_mm: how far what is known may give way."""
+    how many points of the occluding contour count as one; frames: looked at; rounds: most steps; smoothness, sigma_mm:
+    as of the shape; known_mm: how far vertices that are known may move."""
 
     sigma_px: float = 1.5
     reach_mm: float = 8.0
@@ -62,9 +62,10 @@ class Outlines:
 
 
 @dataclass(frozen=True)
-class Rim:
-    """Rim points of all frames that have a border near: frame [n], edge [n, 2], share [n] of the way along it, slope
-    [n, 3] of the distance by the point's place, px per mm, distance [n] px; met: how many of all rim points these are.
+class OccludingContour:
+    """Points of the occluding contour in all frames that have a border near: frame [n], edge [n, 2], share [n] of the
+    way along it, slope [n, 3] of the distance by the point's place, px per mm, distance [n] px; met: how many of all
+    points of the occluding contour these are.
     """
 
     frame: np.ndarray
@@ -86,8 +87,8 @@ def mask_distance(mask: np.ndarray) -> np.ndarray:
     return np.where(person > 0, 0.5 - inside, outside - 0.5).astype(np.float32)
 
 
-def rim_of(mesh: Mesh, usable: np.ndarray, outlines: Outlines, reach_mm: float) -> Rim:
-    """The mesh's rim in the frames. usable [faces] bool: faces whose edges count."""
+def occluding_contour(mesh: Mesh, usable: np.ndarray, outlines: Outlines, reach_mm: float) -> OccludingContour:
+    """The mesh's occluding contour in the frames. usable [faces] bool: faces whose edges count."""
     normals, scene = vertex_normals(mesh.vertices, mesh.faces), RayScene(mesh.vertices, mesh.faces)
     edges = mesh_edges(mesh.faces[usable])[0]
     parts, count = [], 0
@@ -103,7 +104,7 @@ def rim_of(mesh: Mesh, usable: np.ndarray, outlines: Outlines, reach_mm: float) 
         slope = np.einsum("nix,ni->nx", projection_slope(points, pose, lens), outward)
         parts.append((np.full(near.sum(), f), turning[near], share[near], slope[near], apart[near]))
     arrays = [np.concatenate(part) for part in zip(*parts, strict=True)]
-    return Rim(*arrays, met=len(arrays[0]) / max(count, 1))
+    return OccludingContour(*arrays, met=len(arrays[0]) / max(count, 1))
 
 
 def _turning_points(mesh, normals, edges, scene, pose, intrinsics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -128,7 +129,7 @@ def fit_outline(
     usable: np.ndarray,
     known: np.ndarray,
     outlines: Outlines,
-    settings: RimSettings,
+    settings: ContourSettings,
     note: Callable = lambda text: None,
 ) -> tuple[Mesh, dict]:
     """The mesh moved so that its outline meets the masks' borders, as long as that helps held-out frames, and a record
@@ -141,22 +142,22 @@ def fit_outline(
     prior = large_step_metric(parents, spread.shape[1], settings.smoothness, settings.sigma_mm)
     prior = prior + sparse.diags(known[: spread.shape[1]] / settings.known_mm**2)
     start, moved = mesh.vertices, np.zeros((spread.shape[1], 3))
-    rim = rim_of(mesh, usable, outlines, settings.reach_mm)
-    if rim.met < LEAST_MET:
-        note(f"outline: {rim.met:.0%} of it lies near the masks' borders: they are not the head's")
-        return mesh, {"met": rim.met}
-    first = best = _mean_distance(rim, outlines.fitted, settings)
+    contour = occluding_contour(mesh, usable, outlines, settings.reach_mm)
+    if contour.met < LEAST_MET:
+        note(f"outline: {contour.met:.0%} of it lies near the masks' borders: they are not the head's")
+        return mesh, {"met": contour.met}
+    first = best = _mean_distance(contour, outlines.fitted, settings)
     for _ in range(settings.rounds):
-        moved = moved + _step(spread, prior, moved, rim, outlines.fitted, settings)
+        moved = moved + _step(spread, prior, moved, contour, outlines.fitted, settings)
         trial = mesh.replace(vertices=start + spread @ moved)
-        rim = rim_of(trial, usable, outlines, settings.reach_mm)
-        now = _mean_distance(rim, outlines.fitted, settings)
+        contour = occluding_contour(trial, usable, outlines, settings.reach_mm)
+        now = _mean_distance(contour, outlines.fitted, settings)
         note(f"outline: {best[0]:.2f} -> {now[0]:.2f} px fitted, {best[1]:.2f} -> {now[1]:.2f} px held out")
         if not now[1] < best[1]:
             break
         mesh, best = trial, now
     pairs = zip(("fitted_px", "held_out_px"), first, best, strict=True)
-    return mesh, {"met": rim.met} | {name: {"before": before, "after": after} for name, before, after in pairs}
+    return mesh, {"met": contour.met} | {name: {"before": before, "after": after} for name, before, after in pairs}
 
 
 def _before_subdivision(mesh: Mesh) -> tuple[sparse.csr_matrix, np.ndarray]:
@@ -171,14 +172,14 @@ def _before_subdivision(mesh: Mesh) -> tuple[sparse.csr_matrix, np.ndarray]:
     return sparse.identity(len(mesh.vertices), format="csr"), mesh.faces
 
 
-def _step(spread, prior, moved, rim: Rim, fitted: np.ndarray, settings: RimSettings) -> np.ndarray:
+def _step(spread, prior, moved, contour: OccludingContour, fitted: np.ndarray, settings: ContourSettings) -> np.ndarray:
     """Change [C, 3] of the displacement moved [C, 3] of the vertices before the subdivision."""
-    used, count = fitted[rim.frame], spread.shape[0]
-    distance, slope = rim.distance[used], rim.slope[used]
+    used, count = fitted[contour.frame], spread.shape[0]
+    distance, slope = contour.distance[used], contour.slope[used]
     weight = 1.0 / (settings.sigma_px**2 * settings.correlated)
     weight = weight / (1.0 + (distance / (CAUCHY_SCALE * settings.sigma_px)) ** 2)
-    ends = np.stack([1.0 - rim.share[used], rim.share[used]], axis=1)
-    entries = np.repeat(np.arange(len(distance)), 2), rim.edge[used].ravel()
+    ends = np.stack([1.0 - contour.share[used], contour.share[used]], axis=1)
+    entries = np.repeat(np.arange(len(distance)), 2), contour.edge[used].ravel()
     at = sparse.csr_matrix((ends.ravel(), entries), (len(distance), count)) @ spread
     rows = sparse.hstack([sparse.diags(slope[:, k]) @ at for k in range(3)]).tocsr()
     weighted = rows.T @ sparse.diags(weight)
@@ -188,10 +189,10 @@ def _step(spread, prior, moved, rim: Rim, fitted: np.ndarray, settings: RimSetti
     return factor.solve(-gradient).reshape(3, -1).T
 
 
-def _mean_distance(rim: Rim, fitted: np.ndarray, settings: RimSettings) -> tuple[float, float]:
+def _mean_distance(contour: OccludingContour, fitted: np.ndarray, settings: ContourSettings) -> tuple[float, float]:
     """Robust mean distance from the border in fitted and in held-out frames, px; 0 where no border is near."""
-    bounded = np.minimum(np.abs(rim.distance), FARTHEST_SIGMAS * settings.sigma_px)
-    values = (bounded[chosen[rim.frame]] for chosen in (fitted, ~fitted))
+    bounded = np.minimum(np.abs(contour.distance), FARTHEST_SIGMAS * settings.sigma_px)
+    values = (bounded[chosen[contour.frame]] for chosen in (fitted, ~fitted))
     return tuple(float(value.mean()) if len(value) else 0.0 for value in values)
 
 

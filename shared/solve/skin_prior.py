@@ -74,8 +74,11 @@ class SkinPrior:
         means = average @ log_albedo.T
         bright = means.mean(1, keepdims=True)
         own = self.variation
-        parts = (own.brightness, own.brightness_texture, bright), (own.colour, own.colour_texture, means - bright)
-        return SkinPull(average, *(self._precision(*part, open_share) for part in parts))
+        return SkinPull(
+            average,
+            self._precision(own.brightness, own.brightness_texture, bright, open_share),
+            self._precision(own.colour, own.colour_texture, means - bright, open_share),
+        )
 
     def _precision(self, sigma: float, texture: float, values: np.ndarray, share: np.ndarray) -> np.ndarray:
         """[K, K] precision of patches' values [K, C], of which a share [K] of the points is known."""

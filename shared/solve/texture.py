@@ -19,7 +19,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from shared.compiled import compiled
-from shared.gather import BALL_MM, satisfied
+from shared.gather import BALL_MM, is_inactive
 from shared.texels import TexelSamples, TexelSurface
 
 CORRELATED_FRAMES = 6.0
@@ -92,7 +92,7 @@ class NormalEquations:
 
     sums [T, 21]: EE, ES, EI, SS and SI side by side, then EE of the samples that are neither clipped nor crushed, and
     the variance that borders of shadows give a sample, three channels each, so that a frame is added in one go;
-    clipped_ee [T, 3]: EE of clipped samples, satisfied or not.
+    clipped_ee [T, 3]: EE of clipped samples, their bounds active or not.
     """
 
     def __init__(self, texels: int, noise: Noise):
@@ -112,9 +112,11 @@ class NormalEquations:
         """irradiance, reflection, robust, shadow [n, 3] at samples.rows; robust: extra weight per channel; shadow:
         standard deviation of the modelled radiance, since borders of shadows may lie elsewhere; None: of none."""
         shadow = np.zeros_like(irradiance) if shadow is None else shadow
-        limits, noise = samples.limits, (np.float32(self.noise.absolute), np.float32(self.noise.relative))
-        seen = samples.rows, samples.weight, samples.colours, limits, irradiance, reflection, robust, shadow
-        _add_samples(*seen, *noise, self.sums, self.clipped_ee)
+        absolute, relative = np.float32(self.noise.absolute), np.float32(self.noise.relative)
+        _add_samples(
+            samples.rows, samples.weight, samples.colours, samples.saturation, irradiance, reflection, robust, shadow,
+            absolute, relative, self.sums, self.clipped_ee,
+        )
 
     def solve_albedo(self, specular: np.ndarray, fallback: np.ndarray, pull: float | np.ndarray) -> np.ndarray:
         """Albedo [T, 3] for given specular [T]; fallback [T, 3] acts with precision pull, a number or [T, 3]."""
@@ -122,7 +124,7 @@ class NormalEquations:
         return np.clip((moment + pull * fallback) / (self.ee + pull), 0.002, 1.0).astype(np.float32)
 
     def specular_equations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Curvature and moment [T] of each texel's intensity with its albedo eliminated, summed over channels."""
+        """Curvature and moment [T] of each texel's intensity with its albedo projected out, summed over channels."""
         ratio = self.es / np.maximum(self.ee, 1e-6)
         return np.maximum((self.ss - ratio * self.es).sum(1), 0.0), (self.si - ratio * self.ei).sum(1)
 
@@ -217,7 +219,7 @@ class BorderSums:
 
 @compiled
 def _add_samples(
-    rows, weight, colours, limits, irradiance, reflection, robust, shadow, absolute, relative, sums, clipped_ee
+    rows, weight, colours, saturation, irradiance, reflection, robust, shadow, absolute, relative, sums, clipped_ee
 ):
     for i in range(len(rows)):
         row = rows[i]
@@ -232,9 +234,9 @@ def _add_samples(
             sums[row, 9 + c] += weighted * s * s
             sums[row, 12 + c] += weighted * s * colour
             sums[row, 18 + c] += weighted * border * border
-            if limits[i, c] == 0:
+            if saturation[i, c] == 0:
                 sums[row, 15 + c] += weighted * e * e
-            elif limits[i, c] > 0:
+            elif saturation[i, c] > 0:
                 clipped_ee[row, c] += trust * e * e
 
 
@@ -246,28 +248,29 @@ def robust_weight(
     shadow: np.ndarray | None = None,
     scale: float = 2.5,
 ) -> np.ndarray:
-    """Cauchy weight [n, 3] of each sample given the model [n, 3]; 0 where a clipped or crushed sample is satisfied.
+    """Cauchy weight [n, 3] of each sample given the model [n, 3]; 0 where a clipped or crushed sample's bound is
+    inactive.
 
     information [T]: precision of the model's log albedo; what it leaves open is no reason to distrust a sample; shadow
     [n, 3]: standard deviation of the model since borders of shadows may lie elsewhere; None: of none.
     """
     shadow, weight = np.zeros_like(model) if shadow is None else shadow, np.empty_like(model)
     numbers = np.array([noise.absolute, noise.relative, PRIOR_SPREAD**-2, scale**-2], np.float32)
-    _weigh_samples(model, samples.colours, samples.limits, samples.rows, information, shadow, numbers, weight)
+    _weigh_samples(model, samples.colours, samples.saturation, samples.rows, information, shadow, numbers, weight)
     return weight
 
 
-_satisfied = compiled(satisfied)
+_is_inactive = compiled(is_inactive)
 
 
 @compiled
-def _weigh_samples(model, colours, limits, rows, information, shadow, numbers, weight):
+def _weigh_samples(model, colours, saturation, rows, information, shadow, numbers, weight):
     absolute, relative, prior, tightness = numbers
     for i in range(len(model)):
         openness = np.float32(1.0) / (information[rows[i]] + prior)
         for c in range(3):
             error, sigma = model[i, c] - colours[i, c], absolute + relative * colours[i, c]
-            if _satisfied(limits[i, c], error):
+            if _is_inactive(saturation[i, c], error):
                 weight[i, c] = 0.0
                 continue
             variance = sigma * sigma + model[i, c] * model[i, c] * openness + shadow[i, c] * shadow[i, c]

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from shared.gather import Picture, SurfaceViewer, satisfied
+from shared.gather import Picture, SurfaceViewer, is_inactive
 from shared.read_ahead import read_ahead
 from shared.shading import VertexShading
 from shared.solve.capture import frames_of_lights, spread_frames
@@ -69,7 +69,7 @@ class TexturePass:
 
     specular: the clip's one intensity or each texel's [T], the prior's mean; typical_albedo [3]; sigma: how far a texel
     may leave it;
-    light_trust: how much samples of each light count, by how well the model follows it; empty: all alike;
+    light_weights: how much samples of each light count, by how well the model follows it; empty: all alike;
     region [V]: parts of the head, skin and hair, of which one says nothing of the other.
     """
 
@@ -83,7 +83,7 @@ class TexturePass:
         typical_albedo: np.ndarray,
         sigma: float = 0.25,
         noise: Noise | None = None,
-        light_trust: Sequence[float] = (),
+        light_weights: Sequence[float] = (),
         region: np.ndarray | None = None,
         progress: Callable = lambda items, label: items,
     ):
@@ -92,8 +92,8 @@ class TexturePass:
         self.intrinsics = np.broadcast_to(clip.intrinsics, (len(clip.fitted), 3, 3))
         self.light_index = np.zeros(len(clip.fitted), int) if clip.light_index is None else clip.light_index
         lights = frames_of_lights(self.light_index, len(clip.fitted))
-        self.light_trust = tuple(light_trust) or (1.0,) * len(lights)
-        self.systematic = [self._systematic(own) / trust for own, trust in zip(lights, self.light_trust, strict=True)]
+        self.light_weights = tuple(light_weights) or (1.0,) * len(lights)
+        self.systematic = [self._systematic(own) / trust for own, trust in zip(lights, self.light_weights, strict=True)]
         self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), progress
         self.region = region
 
@@ -112,8 +112,10 @@ class TexturePass:
         some = fitted[spread_frames(len(fitted), FIRST_PASS_FRAMES, self.light_index[fitted])]
         (first,) = self._close(self._accumulate(None, some, "texture, first pass"), [mean])
         evidence = self._accumulate(first, fitted, "texture, second pass")
-        prior = self.specular, self.sigma
-        pooled = [pooled_specular(self.surface, evidence.equations, width, *prior) for width in widths]
+        pooled = [
+            pooled_specular(self.surface, evidence.equations, width, mean=self.specular, sigma=self.sigma)
+            for width in widths
+        ]
         candidates = self._close(evidence, pooled)
         errors = self.held_out_errors(candidates)
         best = int(np.argmin(errors))
@@ -126,9 +128,9 @@ class TexturePass:
         borders = [BorderSums(len(self.surface), self.viewer.error_mm) for _ in self.systematic]
         ahead = read_ahead(map(self.view, self.progress(frames, label)))
         for f, view in zip(frames, ahead, strict=True):
-            sums = parts[self.light_index[f]], borders[self.light_index[f]]
-            self._share_out(view, lambda lit, sums=sums: self._add(material, *sums, lit))
-        for part, trust in zip(parts, self.light_trust, strict=True):
+            part, border = parts[self.light_index[f]], borders[self.light_index[f]]
+            self._share_out(view, lambda lit, part=part, border=border: self._add(material, part, border, lit))
+        for part, trust in zip(parts, self.light_weights, strict=True):
             part.scale(trust)
         systematic = [error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
                       + part.highlight_variance(self.specular)
@@ -140,7 +142,7 @@ class TexturePass:
         clip, shading = self.clip, self.shading
         pose, picture, lens = clip.camera_from_head[f], clip.picture(f), self.intrinsics[f]
         view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
-        shadow = shading.shadow_doubt(f) * self.typical_albedo.astype(np.float32)
+        shadow = shading.shadow_uncertainty(f) * self.typical_albedo.astype(np.float32)
         values = np.concatenate([shading.irradiance(f), shading.reflection(f), shadow], axis=1)
         return self.surface.frame_view(view, picture, lens, values)
 
@@ -158,7 +160,7 @@ class TexturePass:
         """A block's samples to its light's sums; without a material every sample that is not at a limit counts."""
         samples = lit.samples
         if material is None:
-            robust = (samples.limits == 0).astype(np.float32)
+            robust = (samples.saturation == 0).astype(np.float32)
         else:
             robust = robust_weight(lit.model(material), samples, self.noise, material.information, lit.shadow)
         part.add(samples, lit.irradiance, lit.reflection, robust, lit.shadow)
@@ -226,6 +228,6 @@ def _squared_errors(candidates: list[TexelMaterial], lit: LitSamples) -> np.ndar
     samples, sums = lit.samples, [lit.samples.weight.sum()]
     for material in candidates:
         error = lit.model(material) - samples.colours
-        error[satisfied(samples.limits, error)] = 0.0
+        error[is_inactive(samples.saturation, error)] = 0.0
         sums.append((samples.weight[:, None] * np.minimum(error**2, 0.01)).sum())
     return np.array(sums, float)

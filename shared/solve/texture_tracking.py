@@ -25,7 +25,7 @@ from shared.solve.first_poses import (
     trackable_faces,
 )
 from shared.solve.tracked_clip import TrackedClip
-from shared.texture_tracks import MeanTexture, Windows, mean_texture, track_frame
+from shared.texture_tracks import MeanContrast, Windows, mean_texture, track_frame
 from shared.tracks import THREADS, visible_vertices
 
 LEAST_COSINE = 0.25
@@ -33,7 +33,7 @@ LEAST_COSINE = 0.25
 
 
 @dataclass(frozen=True)
-class TexturePass:
+class TrackingPass:
     """texel_px: texels per picture pixel; detail: track the finest texture, else the wide contrast; count of tracks."""
 
     texel_px: float
@@ -46,17 +46,17 @@ class TexturePass:
 COARSE_FACE_TEXELS = 280.0
 
 
-def coarse_pass(face_width_px: float) -> TexturePass:
+def coarse_pass(face_width_px: float) -> TrackingPass:
     """The pass that takes in frames whose pose is only interpolated; a large face is seen in larger texels."""
     texel_px = float(np.clip(round(face_width_px / COARSE_FACE_TEXELS), 1.0, 4.0))
-    return TexturePass(texel_px, False, 1500, Windows(sigma=4.0, search=6.0, steps=4), 10.0)
+    return TrackingPass(texel_px, False, 1500, Windows(sigma=4.0, search=6.0, steps=4), 10.0)
 
 
 class AtlasTracker:
     """The frames of a clip over one fitted head."""
 
     def __init__(
-        self, clip: TrackedClip, model: HeadModel, vertices: np.ndarray, depth_mm: float, settings: TexturePass
+        self, clip: TrackedClip, model: HeadModel, vertices: np.ndarray, depth_mm: float, settings: TrackingPass
     ):
         """vertices [V, 3] mm of the fitted head; depth_mm: its distance from the camera."""
         self._clip, self._vertices, self._settings = clip, vertices, settings
@@ -84,7 +84,7 @@ class AtlasTracker:
         )
         return cv2.resize(padded, None, fx=1 / self._shrink, fy=1 / self._shrink, interpolation=cv2.INTER_AREA)
 
-    def mean(self, frames: np.ndarray, poses: np.ndarray, progress: Callable) -> MeanTexture:
+    def mean(self, frames: np.ndarray, poses: np.ndarray, progress: Callable) -> MeanContrast:
         """Mean texture of chosen frames [K] with poses [F, 4, 4]."""
         placed: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -98,7 +98,7 @@ class AtlasTracker:
 
         return mean_texture(lambda: _in_order(picture, progress(frames, "mean texture")))
 
-    def track(self, texture: MeanTexture, frames: np.ndarray, poses: np.ndarray, progress: Callable) -> Tracks:
+    def track(self, texture: MeanContrast, frames: np.ndarray, poses: np.ndarray, progress: Callable) -> Tracks:
         """Tracks of all frames [F]; those that are not among the chosen [K] see nothing."""
         count = len(self.atlas.rows)
         pixels = np.full((len(poses), count, 2), np.nan)
@@ -135,7 +135,7 @@ def track_texture(
     poses: np.ndarray,
     known: np.ndarray,
     tracked: np.ndarray,
-    settings: TexturePass,
+    settings: TrackingPass,
     progress: Callable,
 ) -> tuple[Tracks, np.ndarray, np.ndarray]:
     """Tracks of the frames `tracked` against the mean of the frames `known` ([F] bool), then each frame's own pose.

@@ -31,8 +31,8 @@ from shared.solve.first_poses import (
 )
 from shared.solve.fit_head import FitWeights, HeadFit, fit_codes, landmarks_on_points
 from shared.solve.fit_surface import fit_surface
-from shared.solve.pose_trust import focal_elsewhere, trust
-from shared.solve.texture_tracking import TexturePass, coarse_pass, solve_texture, track_texture
+from shared.solve.pose_trust import estimate_uncertainty, focal_elsewhere
+from shared.solve.texture_tracking import TrackingPass, coarse_pass, solve_texture, track_texture
 from shared.solve.tracked_clip import TrackedClip
 from shared.texture_tracks import Windows
 
@@ -112,7 +112,7 @@ def track_head(
     found = _texture_pass(clip, model, fit, poses, known, coarse_pass(clip.face_width_px), progress)
     note(_summary("tracks", found))
     refuse_still_head(found.solution.camera_from_points[found.reliable])
-    fine = TexturePass(
+    fine = TrackingPass(
         settings.texel_px, True, settings.tracks, Windows(sigma=settings.window_sigma), settings.prior_mm
     )
     for _ in range(settings.fine_passes):
@@ -125,28 +125,28 @@ def track_head(
             note(f"dropped: tracks kept aside went from {held_out[0]:.3f} to {held_out[1]:.3f} px")
             break
         found = finer
-    trusted = trust(clip, found, settings.prior_mm, settings.estimate_focal, elsewhere)
-    found = trusted.adjusted
-    note(f"noise factor {trusted.noise_factor:.2f}, focal length {trusted.focal_gain:.4f} of the given one")
-    lens = zoomed(clip.intrinsics, trusted.focal_gain if trusted.focal_solved else 1.0)
+    estimated = estimate_uncertainty(clip, found, settings.prior_mm, settings.estimate_focal, elsewhere)
+    found = estimated.adjusted
+    note(f"noise factor {estimated.noise_factor:.2f}, focal length {estimated.focal_gain:.4f} of the given one")
+    lens = zoomed(clip.intrinsics, estimated.focal_gain if estimated.focal_solved else 1.0)
     fit, noise = _fit(replace(clip, intrinsics=lens), model, found, settings)
     note(f"depth of a track point: {fit.scale * noise.single:.2f} mm, with what neighbours share "
          f"{fit.scale * np.median(noise.sigma):.2f} mm")
     unit = np.r_[1.0, 1.0, 1.0, np.full(3, fit.scale)]
     return HeadTrack(
         camera_from_head=fit.camera_from_head(found.solution.camera_from_points),
-        covariance=trusted.covariance * np.outer(unit, unit),
+        covariance=estimated.covariance * np.outer(unit, unit),
         fit=fit,
         points_head=fit.to_head(found.solution.points),
         sigma_mm=fit.scale * noise.sigma,
         error_px=found.solution.error_px,
         reliable=found.reliable,
-        noise_factor=trusted.noise_factor,
-        focal_gain=trusted.focal_gain,
-        focal_deviation=trusted.focal_deviation,
-        focal_solved=trusted.focal_solved,
+        noise_factor=estimated.noise_factor,
+        focal_gain=estimated.focal_gain,
+        focal_deviation=estimated.focal_deviation,
+        focal_solved=estimated.focal_solved,
         held_out_px=held_out,
-        held_off=trusted.held_off,
+        held_off=estimated.held_off,
     )
 
 
@@ -158,7 +158,7 @@ def refuse_still_head(camera_from_head: np.ndarray) -> None:
             "the head does not turn",
             got=f"views that are {turned:.2f} degrees apart at most",
             expected=f"{LEAST_ROTATION_DEG:g} degrees or more, better 50",
-            mend="film a head that turns 25 degrees to each side; where a poster, a screen or somebody else shows a "
+            hint="film a head that turns 25 degrees to each side; where a poster, a screen or somebody else shows a "
             "larger face than the person's, cover it or cut it off",
         )
 

@@ -1,6 +1,6 @@
 """A solved head from where no camera stood, and under light that no clip had; what it covers of itself.
 
-The scenery is traced once; a view needs a camera, a relit picture a light. Everything happens in head space: the light
+The transfer is traced once; a view needs a camera, a relit picture a light. Everything happens in head space: the light
 is turned into it, and the head stays where it is ("moves: camera" to the shading).
 """
 
@@ -19,7 +19,7 @@ from shared.mesh import Mesh, interpolate, normalised
 from shared.raycast import camera_hits
 from shared.render import SurfaceMaps, render_frame
 from shared.shading import DEEP, Material, VertexShading
-from shared.solve.capture import Sizes, set_scenery, spread_frames
+from shared.solve.capture import Sizes, precompute_transfer, spread_frames
 from shared.split_sum import SplitSum
 from shared.studio_lights import STUDIO_LIGHTS, studio_light
 from shared.texture import sample_bilinear
@@ -38,7 +38,7 @@ HELD_OUT_SHOWN = 4
 
 
 @dataclass(frozen=True)
-class Camera:
+class ViewCamera:
     """camera_from_head [4, 4] mm, intrinsics [3, 3] px of a picture of size (width, height)."""
 
     camera_from_head: np.ndarray
@@ -53,7 +53,7 @@ def make_views(
     camera_from_head: np.ndarray,
     moves: str,
     pixels: int,
-    held_out: Mapping[int, Camera],
+    held_out: Mapping[int, ViewCamera],
     progress: Callable | None = None,
 ) -> ViewSet:
     """All of them, pixels wide. maps and progress as for HeadViews; envmap [H, 2 H, 3], camera_from_head [F, 4, 4] and
@@ -71,7 +71,7 @@ def make_views(
     )
 
 
-def orbit_camera(mesh: Mesh, yaw_deg: float, pitch_deg: float, pixels: int) -> Camera:
+def orbit_camera(mesh: Mesh, yaw_deg: float, pitch_deg: float, pixels: int) -> ViewCamera:
     """A camera that looks at the head's middle from yaw (90: its left, the picture's right seen from the front) and
     pitch (90: above), a square picture of the given size."""
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
@@ -82,12 +82,12 @@ def orbit_camera(mesh: Mesh, yaw_deg: float, pitch_deg: float, pixels: int) -> C
     rotation = np.stack([right, np.cross(right, back), -back])  # x right, y down, z forward
     focal = FILLED * pixels / 2 * DISTANCE_MM / radius
     intrinsics = np.array([[focal, 0.0, pixels / 2], [0.0, focal, pixels / 2], [0.0, 0.0, 1.0]])
-    return Camera(rigid(rotation, -rotation @ (middle + DISTANCE_MM * back)), intrinsics, (pixels, pixels))
+    return ViewCamera(rigid(rotation, -rotation @ (middle + DISTANCE_MM * back)), intrinsics, (pixels, pixels))
 
 
 def held_out_cameras(
     poses: Mapping[str, np.ndarray], intrinsics: np.ndarray, size: tuple[int, int], solve: Mapping
-) -> dict[int, Camera]:
+) -> dict[int, ViewCamera]:
     """{frame: Camera} of a few held-out frames that inverse_render did not re-render.
 
     poses: its poses.npz; intrinsics [3, 3] and size of the crop, where that does not hold the former; solve: its
@@ -98,7 +98,7 @@ def held_out_cameras(
     rest = [frame for frame in solve.get("held_out_frames", ()) if frame in place and frame not in done]
     chosen = [rest[i] for i in spread_frames(len(rest), HELD_OUT_SHOWN)] if rest else []
     lens = poses.get("intrinsics_crop", intrinsics)
-    return {frame: Camera(poses["camera_from_head"][place[frame]], lens, size) for frame in chosen}
+    return {frame: ViewCamera(poses["camera_from_head"][place[frame]], lens, size) for frame in chosen}
 
 
 def frontal_frame(camera_from_head: np.ndarray) -> int:
@@ -126,7 +126,7 @@ class HeadViews:
         mesh: Mesh,
         maps: Mapping[str, np.ndarray],
         sizes: Sizes | None = None,
-        cameras: Sequence[Camera] = (),
+        cameras: Sequence[ViewCamera] = (),
         progress: Callable | None = None,
         light_resolution: int = LIGHT_RESOLUTION,
         deep: float = DEEP,
@@ -135,19 +135,19 @@ class HeadViews:
         self.light_resolution, self.deep = light_resolution, deep
         self.viewer = SurfaceViewer.of(mesh)
         self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"])
-        self.scenery = set_scenery(self.viewer, sizes or Sizes())
+        self.precomputed = precompute_transfer(self.viewer, sizes or Sizes())
         seen = np.ones(len(mesh.vertices), bool) if not cameras else self._seen(cameras)
         self.index = np.nonzero(seen if only is None else seen & only)[0]
         self.points = mesh_points(mesh, self.index)
         wrap = progress or (lambda items, label: items)
-        self.transfer: Transfer = self.scenery.trace(self.points, lambda items: wrap(items, "visibility"))
+        self.transfer: Transfer = self.precomputed.trace(self.points, lambda items: wrap(items, "visibility"))
         self.material = self._material(mesh, maps)
         # What stands in for a point deep in a cavity is the nearest one in the open. Seen from inside the mouth that
         # can be the outside of the cheek, unless orientation counts as well.
         self._surface_place = np.concatenate([mesh.vertices, ORIENTATION_MM * self.viewer.normals], axis=1)
         self._lit: VertexShading | None = None
 
-    def _seen(self, cameras: Sequence[Camera]) -> np.ndarray:
+    def _seen(self, cameras: Sequence[ViewCamera]) -> np.ndarray:
         """[V] bool: vertices that some camera sees, and those around them, whose triangles reach into the open."""
         seen = np.zeros(len(self.viewer.mesh.vertices), bool)
         for camera in cameras:
@@ -158,7 +158,7 @@ class HeadViews:
         return self.viewer.grown(seen)
 
     @staticmethod
-    def _towards(camera: Camera, positions: np.ndarray) -> np.ndarray:
+    def _towards(camera: ViewCamera, positions: np.ndarray) -> np.ndarray:
         """[N, 3] unit vectors from the positions to the camera."""
         return normalised(camera_centres(camera.camera_from_head[None])[0] - positions)
 
@@ -166,7 +166,7 @@ class HeadViews:
         """The maps at the nodes, for light that bounces, and the roughness at the traced points."""
         uv = np.zeros((len(mesh.vertices), 2))
         uv[mesh.faces.ravel()] = mesh.uvs[mesh.face_uvs.ravel()]
-        nearest = cKDTree(mesh.vertices).query(self.scenery.nodes.points.positions)[1]
+        nearest = cKDTree(mesh.vertices).query(self.precomputed.nodes.points.positions)[1]
         albedo = sample_bilinear(maps["diffuse_albedo"], uv[nearest])
         gloss = float(np.median(sample_bilinear(maps["specular_intensity"], uv)))
         roughness = sample_bilinear(maps["roughness"], uv).ravel()
@@ -174,7 +174,7 @@ class HeadViews:
         return Material(albedo, gloss, float(np.median(roughness)), roughness[self.index] if varies else None)
 
     def render(
-        self, light: np.ndarray, cameras: Sequence[Camera], moves: str = "camera", fade: bool = True
+        self, light: np.ndarray, cameras: Sequence[ViewCamera], moves: str = "camera", fade: bool = True
     ) -> list[np.ndarray]:
         """Lat-long radiance [H, 2 H, 3] -> a linear picture [h, w, 3] per camera, 0 beside the head.
 
@@ -199,10 +199,10 @@ class HeadViews:
                 self._surface_place,
                 self.points,
                 self.transfer,
-                self.scenery.node_transfer,
+                self.precomputed.node_transfer,
                 self.material,
                 light,
-                self.scenery.directions,
+                self.precomputed.directions,
                 poses,
                 moves,
                 key_step=0.0,
@@ -211,7 +211,7 @@ class HeadViews:
             return self._lit
         return self._lit.under(light, poses, moves)
 
-    def coverage(self, camera: Camera, samples: int = 2) -> np.ndarray:
+    def coverage(self, camera: ViewCamera, samples: int = 2) -> np.ndarray:
         """[h, w] in 0 .. 1: how much of each pixel the head covers, as render counts it."""
         covered = np.zeros(camera.size[::-1])
         for row in range(samples):
@@ -221,7 +221,7 @@ class HeadViews:
                 covered += camera_hits(self.viewer.scene, pose, lens, *camera.size, offsets)[0] >= 0
         return covered / samples**2
 
-    def visibility(self, camera: Camera, roughness: float) -> np.ndarray:
+    def visibility(self, camera: ViewCamera, roughness: float) -> np.ndarray:
         """[h, w]: share of a lobe of this roughness about the reflected direction that the head leaves open; NaN beside
         the head. 1 where nothing covers it; for rough lobes it nears the sky's open share."""
         normals = self.points.normals
@@ -229,7 +229,7 @@ class HeadViews:
         facing = np.nonzero(((towards * normals).sum(1) > 0.0) & self._seen([camera])[self.index])[0]
         share = np.ones(len(self.viewer.mesh.vertices))
         visible = self.transfer.visibility(facing)
-        share[self.index[facing]] = SplitSum(self.scenery.directions).visible_share(
+        share[self.index[facing]] = SplitSum(self.precomputed.directions).visible_share(
             normals[facing], towards[facing], roughness, visible
         )
         face, bary, _ = camera_hits(self.viewer.scene, camera.camera_from_head, camera.intrinsics, *camera.size)

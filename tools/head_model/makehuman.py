@@ -73,7 +73,7 @@ class MakeHuman:
                 "a file of the head data is missing",
                 where=str(self._archive.filename),
                 got=member,
-                mend="delete the file and run make setup",
+                hint="delete the file and run make setup",
             )
         return self._archive.read(member)
 

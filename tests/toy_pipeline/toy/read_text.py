@@ -20,7 +20,7 @@ def run(job: Job) -> None:
     """Writes the text and its lines."""
     text = job.subject.video.read_text()
     if "no face" in text:
-        raise InputError("no face in the clip", where=str(job.subject.video), mend="film a face")
+        raise InputError("no face in the clip", where=str(job.subject.video), hint="film a face")
     text = {"lower": text.lower(), "upper": text.upper(), "same": text}[job.params.letters]
     (job.out / "text.txt").write_text(text)
     (job.out / "lines").mkdir()
