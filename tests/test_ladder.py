@@ -245,10 +245,11 @@ def select_meshes(monkeypatch, qualities, **settings):
     """What the clip's model selection leads to if a mesh of each number of subdivisions leaves so much noise."""
     capture, asked = make_truth(specular=0.0)[0], []
 
-    def refine_shape(tracked, frames, known, appearance, sizes, shape, progress, note, begun):
-        asked.append((shape.subdivisions, begun and begun.mesh))
-        return SimpleNamespace(**{**vars(tracked), "capture": noisy(capture, qualities[1 + shape.subdivisions]),
-                                  "mesh": f"level {shape.subdivisions}", "stopped": 3 + shape.subdivisions})
+    def refine_shape(tracked, frames, *, begun, **named):
+        level = named["settings"].subdivisions
+        asked.append((level, begun and begun.mesh))
+        return SimpleNamespace(**{**vars(tracked), "capture": noisy(capture, qualities[1 + level]),
+                                  "mesh": f"level {level}", "stopped": 3 + level})
 
     monkeypatch.setattr(ladder_clip, "SmallClip", Seen)
     monkeypatch.setattr(ladder_clip, "refine_shape", refine_shape)
