@@ -47,6 +47,23 @@ class RayScene:
         return face, bary, np.where(missed, np.inf, np.asarray(hits["tfar"])).astype(np.float32)
 
 
+def on_faces(
+    vertices: np.ndarray, faces: np.ndarray, face: np.ndarray, origins: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Corner weights [N, 3] and distance [N], in units of the direction's length, where rays [N, 3] meet the planes of
+    the faces face [N]: in doubles, where embree's single precision would be taken for a change of the surface.
+
+    Reference: [Moeller1997].
+    """
+    a, b, c = np.moveaxis(np.asarray(vertices, np.float64)[faces[face]], 1, 0)
+    first, second, away = b - a, c - a, origins - a
+    across = np.cross(directions, second)
+    scale = 1.0 / (first * across).sum(1)
+    turned = np.cross(away, first)
+    u, v = scale * (away * across).sum(1), scale * (directions * turned).sum(1)
+    return np.stack([1.0 - u - v, u, v], axis=1), scale * (second * turned).sum(1)
+
+
 def _rays(vectors: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(vectors, np.float32)
 

@@ -4,8 +4,8 @@ import numpy as np
 from shapes import grid_plane, sphere
 
 from shared.geometry import rigid
-from shared.mesh import interpolate
-from shared.raycast import RayScene, camera_hits, pixel_directions
+from shared.mesh import interpolate, normalised
+from shared.raycast import RayScene, camera_hits, on_faces, pixel_directions
 
 
 def test_distance_and_place_of_a_hit():
@@ -51,3 +51,17 @@ def test_pixel_directions_pass_through_pixel_centres():
     directions = pixel_directions(lens, 4, 2)
     assert directions.shape == (2, 4, 3)
     assert np.allclose(directions[0, 0], [(0.5 - 2) / 50, (0.5 - 1) / 50, 1])
+
+
+def test_places_on_faces_are_those_of_embree_in_doubles():
+    ball = sphere(50.0, 3)
+    rng = np.random.default_rng(4)
+    origins = np.array([0.0, 0.0, 200.0]) + rng.uniform(-25.0, 25.0, (200, 3))
+    directions = normalised(rng.uniform(-10.0, 10.0, (200, 3)) - origins)
+    face, rough, distance = RayScene(ball.vertices, ball.faces).intersect(origins, directions)
+    assert (face >= 0).all()
+    bary, exact = on_faces(ball.vertices, ball.faces, face, origins, directions)
+    np.testing.assert_allclose(bary, rough, atol=2e-4)
+    np.testing.assert_allclose(exact, distance, rtol=1e-5)
+    places = interpolate(ball.vertices, ball.faces, face, bary)
+    np.testing.assert_allclose(places, origins + exact[:, None] * directions, atol=1e-11)

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from shared.head_model import HeadModel
 from shared.mesh import interpolate, uniform_laplacian, vertex_normals
-from shared.raycast import RayScene
+from shared.raycast import RayScene, on_faces
 from shared.robust import ROBUST_SCALE
 from shared.solve.depth_noise import DepthNoise
 from shared.solve.fit_head import FitWeights, HeadFit, pullable_vertices
@@ -91,11 +91,13 @@ def _under(model: HeadModel, vertices: np.ndarray, points: np.ndarray, reach_mm:
     normals, usable = vertex_normals(vertices, model.faces), pullable_vertices(model)
     _, nearest = cKDTree(vertices[usable]).query(points)
     along = normals[usable[nearest]]
-    face, bary, distance = RayScene(vertices, model.faces).intersect(points + reach_mm * along, -along)
+    origins = points + reach_mm * along
+    face = RayScene(vertices, model.faces).first_faces(origins, -along)
+    hit = face >= 0
+    face, along = face[hit], along[hit]
+    bary, distance = on_faces(vertices, model.faces, face, origins[hit], -along)
     offset = distance - reach_mm  # of the point above the surface
-    hit = (face >= 0) & (np.abs(offset) < reach_mm)
-    hit[hit] &= (interpolate(normals, model.faces, face[hit], bary[hit]) * along[hit]).sum(1) > 0.5
-    spread = 3.0 * np.median(np.abs(offset[hit])) + 0.05
-    offset = offset[hit].astype(np.float64)
-    weight = 1.0 / (1.0 + (offset / spread) ** 2)
-    return _Under(face[hit], bary[hit].astype(np.float64), offset, along[hit], weight)
+    near = (np.abs(offset) < reach_mm) & ((interpolate(normals, model.faces, face, bary) * along).sum(1) > 0.5)
+    face, bary, offset, along = face[near], bary[near], offset[near], along[near]
+    weight = 1.0 / (1.0 + (offset / (3.0 * np.median(np.abs(offset)) + 0.05)) ** 2)
+    return _Under(face, bary, offset, along, weight)
