@@ -19,8 +19,8 @@ SEED ?= $(shell date +%s)
 .PHONY: setup demo test test-all test-random test-files chart stress lint audit clean
 
 setup: $(STAMP)
-	$(BIN)/python -m tools.check_host
-	$(BIN)/python -m tools.setup_models
+	$(BIN)/python -m tools.setup.host
+	$(BIN)/python -m tools.setup.models
 
 # Every file is compared with its hash, but for CUDA's libraries, which only the package index's torch for Linux wants: it
 # is taken where the CPU build is not to be had.
@@ -41,25 +41,25 @@ test: setup lint
 	$(BIN)/python -m pytest
 
 test-all: setup lint
-	$(BIN)/python -m tools.test_all
+	$(BIN)/python -m tools.setup.test_all
 
 test-random: setup
 	$(BIN)/python -m pytest --order-seed $(SEED)
 
 test-files: setup
-	tools/test_files.sh
+	tools/setup/test_files.sh
 
 chart: setup
-	$(BIN)/python -m tools.chart $(SUBJECT) --cases $(CASES) --out $(OUT)
+	$(BIN)/python -m tools.bench.chart $(SUBJECT) --cases $(CASES) --out $(OUT)
 
 stress: setup
-	$(BIN)/python -m tools.stress build/stress
+	$(BIN)/python -m tools.bench.stress build/stress
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
 
 audit: $(STAMP)
-	$(BIN)/python -m tools.audit --sbom build/sbom.json $(if $(ADVISORIES),--advisories $(ADVISORIES))
+	$(BIN)/python -m tools.setup.audit --sbom build/sbom.json $(if $(ADVISORIES),--advisories $(ADVISORIES))
 
 clean:
 	rm -rf demo build

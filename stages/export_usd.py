@@ -164,8 +164,8 @@ def light_moves(job: Job, moves: str) -> str:
 
 def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, frames, solve: dict):
     """Writes views/novel_*.exr, views/relit_*.exr and the lights -> the ViewSet; None when switched off."""
-    from shared.solve.views import held_out_cameras, make_views
-    from shared.studio_lights import STUDIO_LIGHTS, studio_light
+    from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
+    from shared.rendering.views import held_out_cameras, make_views
 
     if not job.params.views:
         return None
@@ -212,7 +212,7 @@ def write_lights(job: Job, writer, envmap, clips: list) -> None:
 
 def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     """The content of run.json: what each stage was told, what it took, what it found."""
-    from shared.mesh_checks import mesh_warnings
+    from shared.geometry.mesh_checks import mesh_warnings
     from shared.report.gather import own_record, selection_record, stage_record, warnings_of
 
     records, warnings = {}, []
@@ -259,12 +259,12 @@ def method_records(job: Job, record: dict, solve: dict):
 
 def run(job: Job) -> None:
     """Writes the result's files, then the report about them."""
+    from shared.compute.processor import use_baseline_opencv
     from shared.io.arrays import load_arrays, read_json, write_json
     from shared.io.export_maps import MapWriter
     from shared.io.frames import FrameSet
     from shared.io.images import read_exr
     from shared.io.meshes import load_mesh
-    from shared.processor import use_baseline_opencv
     from shared.report.build import ReportInputs, result_report
     from shared.report.methods import methods_paragraphs, methods_text
 
@@ -299,12 +299,12 @@ def check(job: Job) -> None:
     """Reads the files back as a stranger would; LimnError says all that is wrong."""
     import numpy as np
 
+    from shared.geometry.mesh_checks import mesh_errors
     from shared.io.arrays import load_arrays
     from shared.io.export_maps import MAPS, map_errors, map_file
     from shared.io.images import read_exr
     from shared.io.meshes import read_obj
     from shared.io.usd_validate import package_errors, usd_errors
-    from shared.mesh_checks import mesh_errors
 
     mesh = read_obj(job.out / "mesh.obj")
     errors = [f"mesh.obj: {error}" for error in mesh_errors(mesh)]

@@ -40,8 +40,8 @@ def average_frames(job: Job, inputs, surface, viewer) -> tuple:
     """Weighted mean radiance [T, 3] and total weight [T] of the texels over the chosen frames."""
     import numpy as np
 
-    from shared.read_ahead import read_ahead
-    from shared.solve.capture import spread_frames
+    from shared.compute.read_ahead import read_ahead
+    from shared.imaging.frame_index import spread_frames
 
     total, weight = np.zeros((len(surface), 3), np.float32), np.zeros(len(surface), np.float32)
     chosen = spread_frames(len(inputs.camera_from_head), job.params.frames)
@@ -73,7 +73,7 @@ def borders_picture(mean_image, segment_image):
     """uint8 sRGB: the mean texture with the segments' borders in yellow."""
     import numpy as np
 
-    from shared.color import encode_srgb
+    from shared.imaging.color import encode_srgb
 
     picture = np.round(encode_srgb(mean_image) * 255).astype(np.uint8)
     border = np.zeros(segment_image.shape, bool)
@@ -87,12 +87,12 @@ def run(job: Job) -> None:
     """Average, colour the segments, write."""
     import numpy as np
 
-    from shared.gather import SurfaceViewer
+    from shared.compute.processor import use_baseline_opencv
+    from shared.imaging.image_sampling import SurfaceViewer
+    from shared.imaging.texels import TexelSurface
+    from shared.inverse.clip_inputs import read_inputs
     from shared.io.arrays import write_json
-    from shared.io.clip_inputs import read_inputs
     from shared.io.images import write_exr, write_png
-    from shared.processor import use_baseline_opencv
-    from shared.texels import TexelSurface
 
     use_baseline_opencv()
     inputs = read_inputs(job.input("sample_frames"), job.input("track_landmarks"))

@@ -9,13 +9,13 @@ Method   What no track reaches (ears, skull, jaw) moves until the mesh's outline
          stopping on held-out frames; a prior on how skin varies over a face keeps the colours of a room out of the
          albedo. Under that light the mesh is refined from parallax and shading by
          Gauss-Newton, coarse to fine, the light solved anew, and the refined mesh kept if held-out frames fit better.
-         Or (model=auto) the model is chosen first, on few points and frames: shared/solve/ladder.py. Then albedo and
-         specular intensity per texel in closed form, streaming over the frames; samples where a cast shadow ends, which
-         the mesh tells to millimetres only, count less. The solver starts from a uniform light and the priors: of one
-         clip it needs no start from init_albedo, which is an input for comparison only.
-         Or (solver=reference) as published: shared/solve/reference.py.
-         Several clips of one head under different lights are solved as one (shared/solve/joint_clips.py): one mesh and
-         one set of maps, a light and poses of each. What lies at the top is the first clip's then, and clips/ holds
+         Or (model=auto) the model is chosen first, on few points and frames: shared/selection/candidates.py. Then
+         albedo and specular intensity per texel in closed form, streaming over the frames; samples where a cast shadow
+         ends, which the mesh tells to millimetres only, count less. The solver starts from a uniform light and the
+         priors: of one clip it needs no start from init_albedo, which is an input for comparison only.
+         Or (solver=reference) as published: shared/published/solver.py.
+         Several clips of one head under different lights are solved as one (shared/inverse/joint_clips.py): one mesh
+         and one set of maps, a light and poses of each. What lies at the top is the first clip's then, and clips/ holds
          the rest.
 Fails    poses that match no frame; too little of the face seen; results that are not finite.
 """
@@ -159,11 +159,11 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light, poses) -
 
     clip: its ClipInputs; first: of its frames, among all that were solved; light [6 n^2, 3]; poses [F, 4, 4].
     """
-    from shared.envmap import latlong_from_cube
+    from shared.imaging.frame_index import spread_frames
     from shared.io.arrays import save_arrays
     from shared.io.images import write_exr
-    from shared.render import SurfaceMaps, render_frame
-    from shared.solve.capture import spread_frames
+    from shared.rendering.envmap import latlong_from_cube
+    from shared.rendering.render import SurfaceMaps, render_frame
 
     (folder / "renders").mkdir(parents=True)
     latlong = latlong_from_cube(light, LATLONG_HEIGHT)
@@ -187,7 +187,7 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light, poses) -
 
 def read_clips(job: Job) -> tuple:
     """The clip's inputs, or those of all clips."""
-    from shared.io.clip_inputs import read_inputs
+    from shared.inverse.clip_inputs import read_inputs
 
     params = job.params
     given = {"mesh": bool(params.mesh), "poses": bool(params.poses), "fit_frames": params.fit_frames > 0,
@@ -201,11 +201,11 @@ def read_clips(job: Job) -> tuple:
 
 def write_shape(job: Job, inputs, mesh) -> None:
     """mesh.npz with its face segments, and shape.png."""
+    from shared.inverse.problem import FACE_SKIN
     from shared.io.images import write_png
     from shared.io.meshes import save_mesh
-    from shared.shape_pictures import shape_sheet
-    from shared.solve.inverse_problem import FACE_SKIN
-    from shared.solve.reshape import RefinedInputs, faces_of, segments_of, subdivided_to
+    from shared.report.shape_pictures import shape_sheet
+    from shared.shape.refine import RefinedInputs, faces_of, segments_of, subdivided_to
 
     segment = segments_of(inputs, mesh)
     save_mesh(job.out / "mesh.npz", mesh, **({} if segment is None else {"face_segment": segment}))
@@ -217,12 +217,12 @@ def run(job: Job) -> None:
     """Solve the light, then the texels; write and re-render."""
     import numpy as np
 
+    from shared.compute.processor import use_baseline_opencv
+    from shared.inverse.clip_inputs import read_mean_texture
+    from shared.inverse.joint_clips import join_clips
+    from shared.inverse.parameters import read_settings
+    from shared.inverse.solve import solve_clip, summarise
     from shared.io.arrays import write_json
-    from shared.io.clip_inputs import read_mean_texture
-    from shared.processor import use_baseline_opencv
-    from shared.solve.inverse import solve_clip, summarise
-    from shared.solve.inverse_parameters import read_settings
-    from shared.solve.joint_clips import join_clips
 
     use_baseline_opencv()
     clips = read_clips(job)

@@ -52,13 +52,13 @@ FACE = 255
 
 def run(job: Job) -> None:
     """Survey, select, crop, write."""
-    from shared.framing import crop_intrinsics
+    from shared.capture.cameras import source_intrinsics
+    from shared.capture.framing import crop_intrinsics
+    from shared.capture.sample_clip import select_frames, survey_clip
+    from shared.compute.processor import use_baseline_opencv
     from shared.io.arrays import write_json
-    from shared.io.cameras import source_intrinsics
-    from shared.io.models import load_face_networks
     from shared.io.video import open_video
-    from shared.processor import use_baseline_opencv
-    from shared.solve.sample_clip import select_frames, survey_clip
+    from shared.tracking.models import load_face_networks
 
     use_baseline_opencv()
     subject, params = job.subject, job.params
@@ -104,7 +104,7 @@ def transfer_warnings(tag: str, transfer: str) -> list[str]:
 
 def watch_for_chart(reader, subject: Subject):
     """A ChartWatch for the second pass; a frame that the subject points at is looked at now."""
-    from shared.chart_watch import ChartWatch
+    from shared.capture.chart_watch import ChartWatch
 
     place = subject.chart
     chart = ChartWatch(place, subject.transfer)
@@ -122,12 +122,12 @@ def watch_for_chart(reader, subject: Subject):
 
 def write_frames(reader, selection, networks, chart, job: Job) -> tuple[list[dict], list[str]]:
     """The second pass: crops, masks and the contact sheet -> one record per frame, and warnings."""
-    from shared.contact_sheet import ContactSheet
-    from shared.crop_pixels import area_average, clipped_share, display_codes, frame_mask, is_grey
-    from shared.framing import face_height
+    from shared.capture.crop_pixels import area_average, clipped_share, display_codes, frame_mask, is_grey
+    from shared.capture.framing import face_height
+    from shared.compute.read_ahead import read_ahead, write_behind
+    from shared.imaging.picture_detail import ClipDetail
     from shared.io.images import write_png
-    from shared.picture_detail import ClipDetail
-    from shared.read_ahead import read_ahead, write_behind
+    from shared.report.contact_sheet import ContactSheet
 
     for folder in ("frames", "masks"):
         (job.out / folder).mkdir(parents=True, exist_ok=True)
@@ -184,10 +184,10 @@ def frame_record(frame_index: int, time_s: float, points: np.ndarray, sharpness:
 
 def check(job: Job) -> None:
     """Frames in order and of one size, the crop inside the source, its camera consistent, a face in every mask."""
-    from shared.framing import Crop
+    from shared.capture.framing import Crop
+    from shared.compute.read_ahead import read_ahead
     from shared.io.arrays import read_json
     from shared.io.frames import FrameSet
-    from shared.read_ahead import read_ahead
 
     frames, crop = FrameSet.open(job.out), Crop(**read_json(job.out / "frames.json")["crop"])
     source_width, source_height = frames.source_size

@@ -59,8 +59,8 @@ STAGE = Stage(
 
 def read_landmarks(job: Job, frames) -> tuple[np.ndarray, np.ndarray]:
     """All frames through the networks, or the given file -> landmarks [F, 468, 2] px and presence [F]."""
-    from shared.io.given_tracking import read_given_landmarks
-    from shared.io.models import load_face_networks
+    from shared.tracking.given_tracking import read_given_landmarks
+    from shared.tracking.models import load_face_networks
 
     if job.subject.landmarks is not None:
         points, given = read_given_landmarks(job.subject.landmarks, frames.frame_index, frames.crop)
@@ -83,8 +83,8 @@ def build_clip(job: Job, frames, used: np.ndarray, landmarks_px: np.ndarray, giv
     """Contrast pictures and unusable pixels of the frames with a face."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from shared.solve.tracked_clip import TrackedClip, face_width, pictures_of
-    from shared.tracks import THREADS
+    from shared.tracking.tracked_clip import TrackedClip, face_width, pictures_of
+    from shared.tracking.tracks import THREADS
 
     width = face_width(landmarks_px[used])
 
@@ -110,9 +110,9 @@ def build_clip(job: Job, frames, used: np.ndarray, landmarks_px: np.ndarray, giv
 
 def read_settings(job: Job, focal_known: bool):
     """The stage's parameters as the solver's settings."""
-    from shared.solve.first_poses import FlowSettings
-    from shared.solve.fit_head import PUBLISHED, FitWeights
-    from shared.solve.track_head import TrackSettings
+    from shared.tracking.first_poses import FlowSettings
+    from shared.tracking.fit_head import PUBLISHED, FitWeights
+    from shared.tracking.track_head import TrackSettings
 
     params = job.params
     return TrackSettings(
@@ -141,8 +141,8 @@ def excluded_frames(frames, used: np.ndarray, presence: np.ndarray, reasons: lis
 
 def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[dict]) -> dict:
     """tracking.json; its warnings also go to the log."""
-    from shared.geometry import rotation_range_deg
-    from shared.solve.judge_track import rotation_deviation_deg, warnings_of
+    from shared.geometry.transforms import rotation_range_deg
+    from shared.tracking.track_quality import rotation_deviation_deg, warnings_of
 
     lips = track.fit.vertices[np.unique(model.faces[model.segment("lips")])]
     warnings = warnings_of(track, fits, frames.count, frames.focal_known, lips)
@@ -180,15 +180,15 @@ def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[d
 
 def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> None:
     """Writes all outputs."""
-    from shared.bundle import zoomed
+    from shared.geometry.mesh import Mesh
     from shared.io.arrays import save_arrays, write_json
     from shared.io.images import write_png
     from shared.io.meshes import save_mesh
-    from shared.mesh import Mesh
-    from shared.overlay import overlay_strip
-    from shared.solve.first_poses import choose_references
-    from shared.solve.judge_track import frames_that_fit
-    from shared.tracking_pictures import pose_curves, residual_map
+    from shared.report.tracking_overlay import overlay_strip
+    from shared.report.tracking_pictures import pose_curves, residual_map
+    from shared.tracking.bundle import zoomed
+    from shared.tracking.first_poses import choose_references
+    from shared.tracking.track_quality import frames_that_fit
 
     fits, reasons = frames_that_fit(track, job.params.outlier_factor)
     kept, poses, covariance = used[fits], track.camera_from_head[fits], track.covariance[fits]
@@ -223,12 +223,12 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
 
 def run(job: Job) -> None:
     """Landmarks, tracks, poses, head."""
+    from shared.compute.processor import use_baseline_opencv
     from shared.errors import InputError
     from shared.io.frames import FrameSet
-    from shared.io.given_tracking import read_given_poses
-    from shared.io.models import load_head_model
-    from shared.processor import use_baseline_opencv
-    from shared.solve.track_head import track_head
+    from shared.tracking.given_tracking import read_given_poses
+    from shared.tracking.models import load_head_model
+    from shared.tracking.track_head import track_head
 
     use_baseline_opencv()
     frames, model = FrameSet.open(job.input("sample_frames")), load_head_model().subdivided()

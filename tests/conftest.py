@@ -9,7 +9,7 @@ import pytest
 
 # As in the stages (shared.contract.cli.set_threads), before numpy is there: its threads spin when others want cores.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parent / "helpers"))
 pytest_plugins = ["random_order"]
 
 

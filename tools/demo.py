@@ -13,8 +13,8 @@ SUBJECT = ROOT / "demo" / "subject"
 def main() -> int:
     """Exit code 0 when the run and its scoring went through."""
     from tools.limn import main as limn
-    from tools.score import main as score
-    from tools.synthesize import main as synthesize
+    from tools.scoring.score import main as score
+    from tools.synthesis.subject import main as synthesize
 
     began = time.monotonic()
     if not (SUBJECT / "subject.yaml").exists():

@@ -32,10 +32,10 @@ from shared.contract.pipeline import Pipeline, load_pipeline, split_settings
 from shared.contract.subject import MOVES, TRANSFERS
 from shared.contract.wording import unknown_name
 from shared.errors import InputError, LimnError
-from tools.cases import InputErrors, all_parameters, find_subjects, open_cases
-from tools.check_export import check_exports
-from tools.housekeeping import clean, report_path
-from tools.plan import plan_case, plan_lines
+from tools.cli.cases import InputErrors, all_parameters, find_subjects, open_cases
+from tools.cli.check_export import check_exports
+from tools.cli.housekeeping import clean, report_path
+from tools.cli.plan import plan_case, plan_lines
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -141,7 +141,7 @@ def _add_new(commands: argparse._SubParsersAction) -> None:
 
 def validate_command(args: argparse.Namespace) -> int:
     """limn validate"""
-    from tools.validate import validate
+    from tools.cli.validate import validate
 
     opened = open_cases(find_subjects(args.subjects, args.list), None)
     codes = {2 for _ in opened.faults}
@@ -157,10 +157,10 @@ def validate_command(args: argparse.Namespace) -> int:
 
 def run_command(args: argparse.Namespace) -> int:
     """limn run"""
-    from tools.booking import memory_to_give
-    from tools.engine import EngineSettings
-    from tools.gates import check_gates
-    from tools.workflow import default_summary, run_cases
+    from tools.cli.engine import EngineSettings
+    from tools.cli.gates import check_gates
+    from tools.cli.resources import memory_to_give
+    from tools.cli.workflow import default_summary, run_cases
 
     pipeline = _pipeline_of(args)
     parameters = all_parameters(pipeline, args.preset, args.set)
@@ -192,7 +192,7 @@ def plan_command(args: argparse.Namespace) -> int:
 
 def status_command(args: argparse.Namespace) -> int:
     """limn status"""
-    from tools.status import status_lines, status_of
+    from tools.cli.status import status_lines, status_of
 
     records = []
     try:
@@ -217,8 +217,8 @@ def report_command(args: argparse.Namespace) -> int:
 
 def overview_command(args: argparse.Namespace) -> int:
     """limn overview"""
-    from tools.outcome import at_fault
-    from tools.overview import outcome_now, write_overview
+    from tools.cli.outcome import at_fault
+    from tools.cli.overview import outcome_now, write_overview
 
     pipeline = load_pipeline(args.pipeline)
     parameters = all_parameters(pipeline, args.preset, args.set)
@@ -247,7 +247,7 @@ def clean_command(args: argparse.Namespace) -> int:
 
 def new_command(args: argparse.Namespace) -> int:
     """limn new"""
-    from tools.new_subject import NewSubject, make_subject
+    from tools.cli.new_subject import NewSubject, make_subject
 
     folder, facts = make_subject(NewSubject(
         args.clip, args.name, args.dest, args.link, args.focal_length_mm, args.sensor_width_mm, args.focal_length_px,

@@ -9,7 +9,6 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from shared.contract.currency import reasons_to_run, work_to_do
@@ -23,29 +22,13 @@ from shared.contract.interpreter import set_threads, settle
 from shared.contract.job import Job
 from shared.contract.manifest import read_manifest
 from shared.contract.needs import amount, measured_scale, scale_of
-from shared.contract.pipeline import REPOSITORY, Pipeline, load_pipeline, split_settings
+from shared.contract.pipeline import Pipeline, load_pipeline, split_settings
 from shared.contract.progress import Reporter
+from shared.contract.request import Request
 from shared.contract.subject import Subject, load_subject
 from shared.errors import InputError
 
 _LOCK_WAIT_S = 10.0
-
-
-@dataclass(frozen=True)
-class Request:
-    """What one call of a stage asks for, checked. roots: where the code lies whose changes are noticed."""
-
-    stage: Stage
-    subject: Subject
-    run: RunFolder
-    parameters: dict[str, object]
-    threads: int
-    force: bool
-    verify: bool
-    events: Path | None
-    disk_mb: float | None = None
-    renew: bool = False
-    roots: tuple[Path, ...] = (REPOSITORY,)
 
 
 def main(stage: Stage, run: Callable[[Job], None], check: Callable[[Job], None] | None = None,

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
 
 from shared.contract.currency import input_hashes, work_to_do
 from shared.contract.declare import EXPORT
@@ -18,12 +17,10 @@ from shared.contract.job import Job
 from shared.contract.manifest import LOG, MANIFEST, PROVENANCE, Work, output_entries, volatile_entries, write_record
 from shared.contract.progress import Reporter
 from shared.contract.provenance import Meter, environment
+from shared.contract.request import Request
 from shared.contract.source import loaded_code
 from shared.contract.sums import write_sums
 from shared.errors import InputError, LimnError
-
-if TYPE_CHECKING:
-    from shared.contract.cli import Request
 
 _LAST_LINES = 20
 

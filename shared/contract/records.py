@@ -1,6 +1,6 @@
 """What stands in every JSON and NPZ file that the stages write; stages declare their outputs with these.
 
-docs/files.md is written from here (`python -m tools.readme`), and tests compare a run's files with it.
+docs/files.md is written from here (`python -m tools.documents.readme`), and tests compare a run's files with it.
 """
 
 from __future__ import annotations

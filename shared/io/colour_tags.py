@@ -14,8 +14,8 @@ from functools import cache
 import av
 import numpy as np
 
-from shared.color import decode_hlg, decode_pq, decode_transfer, encode_transfer, rec709_from_primaries
 from shared.errors import InputError
+from shared.imaging.color import decode_hlg, decode_pq, decode_transfer, encode_transfer, rec709_from_primaries
 
 UNSPECIFIED, LINEAR = 2, 8
 _D65, _C = (0.3127, 0.3290), (0.310, 0.316)

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from shared.color import encode_srgb
+from shared.imaging.color import encode_srgb
 from shared.io.images import write_exr, write_png
 
 # name -> (colour or data, what one unit is)

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 
-from shared.color import rec709_from_primaries
 from shared.errors import InputError
+from shared.imaging.color import rec709_from_primaries
 from shared.io.exr_header import ExrPart, check_decodable, read_parts
 from shared.io.images import read_exr
 from shared.io.source import check_size

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from shared.color import decode_transfer
 from shared.errors import InputError
+from shared.imaging.color import decode_transfer
 from shared.io.arrays import read_json
 from shared.io.images import read_png
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.color import decode_transfer, rec709_from_primaries
 from shared.errors import InputError
+from shared.imaging.color import decode_transfer, rec709_from_primaries
 from shared.io.colour_tags import PRIMARIES
 
 MOST_PROFILE_BYTES = 4_000_000

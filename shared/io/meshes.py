@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from shared.errors import InputError
+from shared.geometry.mesh import Mesh
 from shared.io.arrays import load_arrays, save_arrays
-from shared.mesh import Mesh
 
 
 def save_mesh(path: Path | str, mesh: Mesh, **extra: np.ndarray) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from shared.color import decode_transfer, encode_srgb
 from shared.errors import LimnError
+from shared.imaging.color import decode_transfer, encode_srgb
 from shared.io.frames import FrameSet
 
 LONGEST_SIDE, QUALITY = 1024, 88

@@ -28,6 +28,7 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from shared.errors import LimnError
+from shared.geometry.mesh import Mesh
 from shared.io.usd_capture import (
     Plate,
     UsdCapture,
@@ -39,7 +40,6 @@ from shared.io.usd_capture import (
 )
 from shared.io.usd_geometry import define_mesh
 from shared.io.usd_material import TextureFile, define_material
-from shared.mesh import Mesh
 
 METERS_PER_UNIT = 0.001
 VARIANT_SET, VARIANT_CLIP, VARIANT_STILL = "capture", "clip", "still"

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
-from shared.geometry import WORLD_FROM_CAMERA, invert_rigid
+from shared.geometry.transforms import WORLD_FROM_CAMERA, invert_rigid
 from shared.io.usd_geometry import define_card
 from shared.io.usd_material import TextureFile, define_plate_material
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from shared.mesh import Mesh, vertex_normals
+from shared.geometry.mesh import Mesh, vertex_normals
 
 
 def define_mesh(stage: Usd.Stage, path: str, mesh: Mesh) -> UsdGeom.Mesh:

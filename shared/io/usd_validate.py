@@ -16,9 +16,9 @@ import MaterialX as mx
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdValidation
 
+from shared.geometry.mesh import Mesh
+from shared.geometry.mesh_checks import mesh_errors
 from shared.io.usd_material import NORMAL_BIAS, NORMAL_SCALE
-from shared.mesh import Mesh
-from shared.mesh_checks import mesh_errors
 
 MATERIALX_PREFIX = "ND_"
 _FALSE_ALARM = "MissingShaderIdInRegistry"

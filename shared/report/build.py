@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
+from shared.geometry.mesh import Mesh
 from shared.io.export_maps import SOLVED_MAPS
 from shared.io.frames import FrameSet
 from shared.io.images import read_png
-from shared.mesh import Mesh
+from shared.rendering.view_set import ViewSet
 from shared.report.content import ClipContent, ReportContent, StageCost
 from shared.report.gather import chosen_frames, compared_frames, excluded_frames, motion
 from shared.report.page import report_html
 from shared.report.sections import number
-from shared.view_set import ViewSet
 
 FRAMES_OF_OTHER_CLIPS = 3
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from shared.mesh import Mesh
-from shared.view_set import ViewSet
+from shared.geometry.mesh import Mesh
+from shared.rendering.view_set import ViewSet
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from shared.geometry import WORLD_FROM_CAMERA, invert_rigid
+from shared.geometry.transforms import WORLD_FROM_CAMERA, invert_rigid
 from shared.io.arrays import read_json
 from shared.io.frames import FrameSet
 from shared.io.images import read_exr

@@ -9,7 +9,7 @@ from string import Template
 
 import numpy as np
 
-from shared.mesh import vertex_normals
+from shared.geometry.mesh import vertex_normals
 from shared.report import model_sections, sections, view_sections
 from shared.report.content import ReportContent
 from shared.report.pictures import jpeg_uri, shrunk, srgb_bytes

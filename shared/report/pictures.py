@@ -7,7 +7,7 @@ import base64
 import cv2
 import numpy as np
 
-from shared.color import encode_srgb
+from shared.imaging.color import encode_srgb
 
 ERROR_RANGE = 0.05
 """The error map runs from -ERROR_RANGE to +ERROR_RANGE of linear radiance, clip maximum 1."""

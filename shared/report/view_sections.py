@@ -6,10 +6,10 @@ from html import escape
 
 import numpy as np
 
+from shared.rendering.studio_lights import STUDIO_LIGHTS
+from shared.rendering.view_set import NOVEL_VIEWS, ViewSet
 from shared.report.pictures import grey_bytes, jpeg_uri, shrunk, srgb_bytes
 from shared.report.sections import figure
-from shared.studio_lights import STUDIO_LIGHTS
-from shared.view_set import NOVEL_VIEWS, ViewSet
 
 VIEW_PIXELS, SHEET_PIXELS = 512, 1600
 _NOTHING = 90

@@ -9,7 +9,7 @@ import base64
 
 import numpy as np
 
-from shared.mesh import Mesh
+from shared.geometry.mesh import Mesh
 
 FACE_LIMIT = 40_000
 """About 700 kB on the page; the eye sees no difference at its size."""
@@ -18,7 +18,7 @@ FACE_LIMIT = 40_000
 def coarser(mesh: Mesh) -> Mesh | None:
     """The mesh before its last subdivision, or None when it is none: F / 4 faces over the same vertices and UVs.
 
-    shared.mesh keeps the four children of a face together, three at its corners and one in the middle.
+    shared.geometry.mesh keeps the four children of a face together, three at its corners and one in the middle.
     """
     faces, face_uvs = _parents(mesh.faces), _parents(mesh.face_uvs)
     return None if faces is None or face_uvs is None else mesh.replace(faces=faces, face_uvs=face_uvs)

@@ -1,8 +1,7 @@
 """Golden files: what each stage makes of its own inputs, and how far that may lie apart on another processor.
 
-Read in this order: tiny (the subject, its settings), inputs (what a stage gets to read), measures (what is compared),
-kernels (ways to run the same code), golden (the files and their tolerances), chain, spread, mutations, parting.
-May import everything; nothing but tests imports it.
+Read in this order: kernels, tiny, inputs, measures, golden, chain, spread, mutations, parting.
+May import: shared, tools.limn, tools.scoring.
 
     python -m tools.goldens write [STAGE|chain]  runs each stage from its kept inputs and rewrites its golden file
     python -m tools.goldens spread               the same work under several kernels and thread counts: a table

@@ -10,7 +10,7 @@ from shared.io.arrays import read_json, write_json
 from tools.goldens.golden import SPREADS
 from tools.goldens.kernels import KERNELS, OWN, Kernel, run_stage
 from tools.goldens.tiny import GOLDEN_FOLDER, SETTINGS, STAGES, TINY_SUBJECT
-from tools.score import score
+from tools.scoring.score import score
 
 CHAIN_FILE = GOLDEN_FOLDER / "chain.json"
 

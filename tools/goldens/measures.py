@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from shared.io.arrays import load_arrays, read_json
 from shared.io.images import read_exr, read_png
 from shared.io.meshes import load_mesh, read_obj
-from tools.score_measures import ENVMAP_LOBE_SHARPNESS, FRONT_LIMIT, latlong_directions
+from tools.scoring.measures import ENVMAP_LOBE_SHARPNESS, FRONT_LIMIT, latlong_directions
 
 BLOCKS = 8
 LEAST_WEIGHT = 0.05

@@ -62,7 +62,8 @@ class Recorder:
     def __call__(self, frame: FrameType, event: str, value: object) -> None:
         if event != "return" or not frame.f_code.co_filename.startswith(_OWN) or frame.f_code.co_flags & 0x20:
             return  # 0x20: a generator, which returns nothing of its own
-        name = f"{Path(frame.f_code.co_filename).stem}.{frame.f_code.co_qualname}"
+        module = Path(frame.f_code.co_filename).relative_to(REPOSITORY).with_suffix("")
+        name = ".".join((*module.parts, frame.f_code.co_qualname))
         number = self._counts[name] = self._counts.get(name, -1) + 1
         if number < _MOST_CALLS:
             digests = [digest(array) for array in numbers_of(value)]

@@ -1,0 +1,169 @@
+"""The factor per colour channel between light and albedo: what the clip cannot say, said by stated priors, and by a
+colour chart where one is in view.
+
+Twice the light on half the albedo gives the same diffuse picture. Three statements fix the factor, each a normal
+distribution over logarithms, and a chart is a fourth (chart_scale):
+
+- skin's luminance: log Y is normal with the median and the spread of reference skins of all tones;
+- skin's chroma lies on the locus of measured skins: log R/G and log B/G are linear in log Y, sigma as found there;
+- the light on the skin is white after the camera's own white balance: log R/G and log B/G ~ N(0, 0.15).
+
+With u [3] the log of the mean irradiance on the skin and y [3] the log of the mean radiance that it returns, albedo is
+exp(y - u) and all of it is one quadratic in u.
+
+References: skin I to VI of the Physically Based database (physicallybased.info, CC0), the same that OpenPBR viewers
+offer; ColorChecker patches "light skin" and "dark skin" (sRGB values of X-Rite, November 2014).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from shared.imaging.color import LUMINANCE
+
+REFERENCE_SKINS = np.array(
+    [
+        [0.847, 0.638, 0.552],
+        [0.799, 0.485, 0.347],
+        [0.623, 0.433, 0.343],
+        [0.436, 0.227, 0.131],
+        [0.283, 0.148, 0.079],
+        [0.090, 0.050, 0.020],
+        [0.539, 0.305, 0.223],
+        [0.171, 0.084, 0.058],
+    ]
+)
+"""Linear Rec.709 reflectance of reference skins, light to dark, then the two chart patches."""
+
+LUMINANCE_SIGMA = float(np.std(np.log(REFERENCE_SKINS @ LUMINANCE), ddof=1))
+"""Of the reference skins' log luminance: 0.87. Anything narrower darkens the fair and lightens the dark."""
+WHITE_SIGMA = 0.15
+HIGHLIGHT_SIGMA = 0.08
+MODEL_ERROR = 0.003
+"""Share of the diffuse radiance that passes for highlights where shape or visibility are a little off."""
+
+
+@dataclass(frozen=True)
+class Highlights:
+    """Per channel [3]: the specular intensity that fits best with the light as it is, the precision of that, and the
+    diffuse radiance relative to the specular one, by which errors of the diffuse model are magnified."""
+
+    intensity: np.ndarray
+    precision: np.ndarray
+    diffuse_share: np.ndarray
+
+
+@dataclass(frozen=True)
+class SkinLocus:
+    """log R/G and log B/G of skin: offset + slope * (log Y - mean_log_luminance), each [2], spread sigma [2]."""
+
+    mean_log_luminance: float
+    offset: np.ndarray
+    slope: np.ndarray
+    sigma: np.ndarray
+
+
+def fit_skin_locus(skins: np.ndarray = REFERENCE_SKINS) -> SkinLocus:
+    """Least-squares line through reference skins [N, 3]; the spread is the residual's, unbiased."""
+    logs = np.log(skins)
+    luminance = np.log(skins @ LUMINANCE)
+    mean = float(np.median(luminance))
+    chroma = logs[:, [0, 2]] - logs[:, [1]]
+    design = np.stack([np.ones_like(luminance), luminance - mean], axis=1)
+    (offset, slope), *_ = np.linalg.lstsq(design, chroma, rcond=None)
+    residual = chroma - design @ np.stack([offset, slope])
+    return SkinLocus(mean, offset, slope, np.sqrt((residual**2).sum(0) / (len(skins) - 2)))
+
+
+def scale_prior(
+    log_radiance: np.ndarray,
+    white_sigma: float = WHITE_SIGMA,
+    locus: SkinLocus | None = None,
+    relative_light: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The priors as residuals A u - b of unit variance in u = log mean irradiance [3], given y = log_radiance [3].
+
+    relative_light [L, 3]: log irradiance of several lights relative to u; each is expected to be white by itself.
+    Luminance enters linearised: d log Y = sum_c share_c d log a_c, with the shares of a typical skin.
+    """
+    locus = locus or fit_skin_locus()
+    typical = np.median(REFERENCE_SKINS, axis=0)
+    share = LUMINANCE * typical / (LUMINANCE @ typical)
+    constant = float(np.log(LUMINANCE @ typical) - share @ np.log(typical))
+    ratio = np.array([[1.0, -1.0, 0.0], [0.0, -1.0, 1.0]])
+    # Rows act on log albedo q = y - u: value = row @ q + const.
+    rows, targets, sigmas = [share], [locus.mean_log_luminance - constant], [LUMINANCE_SIGMA]
+    for k in range(2):
+        rows.append(ratio[k] - locus.slope[k] * share)
+        targets.append(locus.offset[k] + locus.slope[k] * (constant - locus.mean_log_luminance))
+        sigmas.append(locus.sigma[k])
+    rows, targets, sigmas = np.array(rows), np.array(targets), np.array(sigmas)
+    on_skin = -rows / sigmas[:, None]
+    right = (targets - rows @ log_radiance) / sigmas
+    relative = np.zeros((1, 3)) if relative_light is None else relative_light
+    white = [ratio / white_sigma] * len(relative)
+    return np.concatenate([on_skin, *white]), np.concatenate([right, (-relative @ ratio.T).ravel() / white_sigma])
+
+
+def most_likely_irradiance(log_radiance: np.ndarray, white_sigma: float = WHITE_SIGMA) -> np.ndarray:
+    """u [3]: the log mean irradiance that the priors alone prefer for skin of log mean radiance y [3]."""
+    matrix, right = scale_prior(log_radiance, white_sigma)
+    return np.linalg.lstsq(matrix, right, rcond=None)[0]
+
+
+def resolve_scale(
+    log_albedo: np.ndarray,
+    log_irradiance: np.ndarray,
+    highlights: Highlights | None,
+    specular_prior: tuple[float, float],
+    white_sigma: float = WHITE_SIGMA,
+    chart: tuple[np.ndarray, np.ndarray] | None = None,
+    relative_light: np.ndarray | None = None,
+) -> tuple[np.ndarray, float]:
+    """The factor on the light per channel and the specular intensity that are jointly most likely.
+
+    The lobe returns the light's own colour and its strength has a known range, so highlights say something about the
+    scale that diffuse skin cannot: with the light multiplied by k, channel c wants s k_c = t_c. log_albedo,
+    log_irradiance [3] are the skin's present means; specular_prior: mean of s and standard deviation of its logarithm;
+    chart: the log factor [3] on the light that a colour chart asks for, and its covariance [3, 3]; relative_light: see
+    scale_prior. With a chart the highlights give s alone: on the scale their range has little to add, and the model's
+    errors pass for highlights.
+    -> log k [3], and s, the prior's mean without highlights.
+    """
+    matrix, right = scale_prior(log_albedo + log_irradiance, white_sigma, relative_light=relative_light)
+    if chart is not None:
+        whitening = np.linalg.inv(np.linalg.cholesky(chart[1]))
+        matrix = np.concatenate([matrix, whitening])
+        right = np.concatenate([right, whitening @ (log_irradiance + chart[0])])
+    mean, sigma = specular_prior
+    alone = np.linalg.lstsq(matrix, right - matrix @ log_irradiance, rcond=None)[0]
+    if highlights is None:
+        return alone, mean
+    best = np.clip(highlights.intensity, 0.05, 2.0)
+    spread = _highlight_spread(highlights, mean)
+
+    def on_highlights(log_factor: np.ndarray, log_intensity: float) -> np.ndarray:
+        amplitude = (log_intensity + log_factor - np.log(best)) / spread
+        robust = np.sign(amplitude) * np.sqrt(np.log1p(amplitude**2))
+        return np.append(robust, (log_intensity - np.log(mean)) / sigma)
+
+    def jointly(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([matrix @ (log_irradiance + x[:3]) - right, on_highlights(x[:3], x[3])])
+
+    if chart is not None:
+        solved = least_squares(lambda x: on_highlights(alone, x[0]), [np.log(mean)], method="lm").x
+        return alone, float(np.exp(solved[0]))
+    solved = least_squares(jointly, np.append(alone, np.log(mean)), method="lm").x
+    return solved[:3], float(np.exp(solved[3]))
+
+
+def _highlight_spread(highlights: Highlights, mean_intensity: float) -> np.ndarray:
+    """Standard deviation [3] of the log intensities: the diffuse model's errors and, where highlights are faint or few,
+    what the samples leave open. Beyond it the loss is Cauchy's: channels that contradict skin have met something else.
+    """
+    modelled = HIGHLIGHT_SIGMA * highlights.diffuse_share / highlights.diffuse_share.mean()
+    sampled = 1.0 / (highlights.precision * mean_intensity**2)
+    return np.sqrt(modelled**2 + sampled + (highlights.diffuse_share * MODEL_ERROR) ** 2)

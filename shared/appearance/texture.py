@@ -1,0 +1,304 @@
+"""Albedo and specular intensity per texel, from all frames, in closed form.
+
+Frames stream through: each adds its share to every texel's normal equations, so memory depends on the map's size
+alone (100 bytes per texel). With the light, the roughness and the geometry given, a texel's radiance is linear in its
+albedo a [3] and its specular intensity s:  I = a E + s S. A second pass over the frames weighs each sample by how well
+the first pass's result explains it (Cauchy), which leaves out hair, blinks and what slid by.
+
+The intensity of a single texel is poorly determined, but it varies slowly over skin: its equations (albedo
+eliminated) are summed over a neighbourhood on the map before they are solved. How wide is chosen on held-out frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from shared.compute.compiled import compiled
+from shared.imaging.image_sampling import BALL_MM, is_inactive
+from shared.imaging.texels import TexelSamples, TexelSurface
+
+CORRELATED_FRAMES = 6.0
+"""Errors of neighbouring frames are alike: so many frames count as one independent observation."""
+
+PRIOR_SPREAD = 0.3
+"""Standard deviation of a texel's log albedo if all one knew were the person's mean."""
+
+IRRADIANCE_ERROR = 0.03
+"""Error of the modelled irradiance, relative to the face's mean: bounces, visibility and shape are so good at best.
+In a cavity that gets a tenth of the light it leaves the albedo open by a third."""
+
+NORMAL_ERROR = 0.05
+"""Error of a normal in radians: what a refined mesh still lacks. Where light grazes the skin it passes for albedo."""
+
+HIGHLIGHT_ERROR = 0.1
+"""Error of a modelled highlight, relative to itself."""
+
+LEAST_MATTE_SHARE = 0.05
+"""Of what a texel sends out, where its modelled highlights leave less or nothing."""
+
+LEAST_BORDER_MM = 0.5
+"""Error of where the head's outline lies, however well its surface is known."""
+
+PRODUCTS = 7
+"""That the normal equations sum up per channel."""
+
+POOL = 1.0
+"""Texels of a neighbourhood that count as independent for the specular intensity: errors of shape and light are as
+wide as the neighbourhood itself."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviation of a sample: absolute + relative * radiance."""
+
+    absolute: float = 0.006
+    relative: float = 0.03
+
+    def precision(self, colours: np.ndarray) -> np.ndarray:
+        """Inverse variance, the shape of colours."""
+        return 1.0 / np.square(self.absolute + self.relative * colours)
+
+
+@dataclass(frozen=True)
+class TexelMaterial:
+    """albedo [T, 3] and specular [T] of the texels, information [T]: precision of the log albedo by
+    the samples, in the channel that they determine least."""
+
+    albedo: np.ndarray
+    specular: np.ndarray
+    information: np.ndarray
+
+    def radiance(self, rows: np.ndarray, irradiance: np.ndarray, reflection: np.ndarray) -> np.ndarray:
+        """a E + s S of the texels rows [n]; E, S [n, 3] -> [n, 3] float32."""
+        sent = np.empty(irradiance.shape, np.float32)
+        _radiance(self.albedo, self.specular, rows, irradiance, reflection, sent)
+        return sent
+
+
+@compiled
+def _radiance(albedo, specular, rows, irradiance, reflection, sent):
+    for i in range(len(rows)):
+        for c in range(3):
+            sent[i, c] = albedo[rows[i], c] * irradiance[i, c] + specular[rows[i]] * reflection[i, c]
+
+
+class NormalEquations:
+    """Sums over frames per texel and channel of weighted products of E, S and the colour I.
+
+    sums [T, 21]: EE, ES, EI, SS and SI side by side, then EE of the samples that are neither clipped nor crushed, and
+    the variance that borders of shadows give a sample, three channels each, so that a frame is added in one go;
+    clipped_ee [T, 3]: EE of clipped samples, their bounds active or not.
+    """
+
+    def __init__(self, texels: int, noise: Noise):
+        self.noise, self.sums = noise, np.zeros((texels, 3 * PRODUCTS), np.float32)
+        self.clipped_ee = np.zeros((texels, 3), np.float32)
+        columns = (self.sums[:, 3 * k : 3 * k + 3] for k in range(PRODUCTS))
+        self.ee, self.es, self.ei, self.ss, self.si, self.measured_ee, self.shadow = columns
+
+    def add(
+        self,
+        samples: TexelSamples,
+        irradiance: np.ndarray,
+        reflection: np.ndarray,
+        robust: np.ndarray,
+        shadow: np.ndarray | None = None,
+    ) -> None:
+        """irradiance, reflection, robust, shadow [n, 3] at samples.rows; robust: extra weight per channel; shadow:
+        standard deviation of the modelled radiance, since borders of shadows may lie elsewhere; None: of none."""
+        shadow = np.zeros_like(irradiance) if shadow is None else shadow
+        absolute, relative = np.float32(self.noise.absolute), np.float32(self.noise.relative)
+        _add_samples(
+            samples.rows, samples.weight, samples.colours, samples.saturation, irradiance, reflection, robust, shadow,
+            absolute, relative, self.sums, self.clipped_ee,
+        )
+
+    def solve_albedo(self, specular: np.ndarray, fallback: np.ndarray, pull: float | np.ndarray) -> np.ndarray:
+        """Albedo [T, 3] for given specular [T]; fallback [T, 3] acts with precision pull, a number or [T, 3]."""
+        moment = self.ei - specular[:, None] * self.es
+        return np.clip((moment + pull * fallback) / (self.ee + pull), 0.002, 1.0).astype(np.float32)
+
+    def specular_equations(self) -> tuple[np.ndarray, np.ndarray]:
+        """Curvature and moment [T] of each texel's intensity with its albedo projected out, summed over channels."""
+        ratio = self.es / np.maximum(self.ee, 1e-6)
+        return np.maximum((self.ss - ratio * self.es).sum(1), 0.0), (self.si - ratio * self.ei).sum(1)
+
+    def information(self, typical_albedo: np.ndarray, systematic: np.ndarray) -> np.ndarray:
+        """[T, 3] precision of the log albedo per channel, with correlated frames taken together.
+
+        A clipped sample only says "at least so much": it moves the albedo but measures nothing, and what is not
+        clipped of a texel that mostly is are its darkest samples, which say too little. Where little light arrives a
+        small error makes a large albedo: typical_albedo [3] bounds what counts; systematic [T, 3]: variance that all
+        frames share.
+        """
+        albedo = self._bounded_albedo(typical_albedo)
+        spared = self.measured_ee / np.maximum(self.measured_ee + self.clipped_ee, 1e-9)
+        return 1.0 / (systematic + CORRELATED_FRAMES / np.maximum(spared**2 * self.measured_ee * albedo**2, 1e-9))
+
+    def shadow_variance(self, typical_albedo: np.ndarray) -> np.ndarray:
+        """[T, 3] of the log albedo, since borders of shadows may lie elsewhere: in all frames the same mesh casts
+        them. typical_albedo [3]: what the samples' variance was reckoned with."""
+        return self.shadow / np.maximum(self.ee * np.square(typical_albedo), 1e-9)
+
+    def highlight_variance(self, specular: float | np.ndarray) -> np.ndarray:
+        """[T, 3] of the log albedo, since highlights of intensity `specular`, one or [T], are wrong by HIGHLIGHT_ERROR
+        of themselves: little where they are a small share of what a texel sends out, all of it in hair that the model
+        gives a skin's gloss."""
+        share = np.reshape(specular, (-1, 1)) * self.es / np.maximum(self.ei, 1e-9)
+        return np.square(HIGHLIGHT_ERROR * share / np.maximum(1.0 - share, LEAST_MATTE_SHARE))
+
+    def _bounded_albedo(self, typical_albedo: np.ndarray) -> np.ndarray:
+        return np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)
+
+    def scale(self, trust: float) -> None:
+        """All weights times that."""
+        if trust != 1.0:
+            self.sums *= trust
+            self.clipped_ee *= trust
+
+    def trusted_share(self, typical_albedo: np.ndarray, systematic: np.ndarray) -> np.ndarray:
+        """[T, 3]: how much of their weight errors that all frames share leave to the equations, among those of other
+        lights."""
+        precision = self.ee * np.square(self._bounded_albedo(typical_albedo)) / CORRELATED_FRAMES
+        return 1.0 / (1.0 + precision * systematic)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the frames of all lights say: equations, information [T, 3] on the log albedo, and systematic [T, 3]: the
+    variance that is left however many frames there are."""
+
+    equations: NormalEquations
+    information: np.ndarray
+    systematic: np.ndarray
+
+
+def weigh_lights(
+    parts: Sequence[NormalEquations], systematic: Sequence[np.ndarray], typical_albedo: np.ndarray
+) -> Evidence:
+    """The equations of each light with the variance [T, 3] that its frames share -> of all lights together.
+
+    Where one light grazes or hardly reaches a texel another one decides: two lights' errors have nothing in common.
+    """
+    information = sum(own.information(typical_albedo, error) for own, error in zip(parts, systematic, strict=True))
+    if len(parts) == 1:
+        return Evidence(parts[0], information, systematic[0])
+    whole = NormalEquations(len(information), parts[0].noise)
+    left = np.zeros_like(information)
+    for own, error in zip(parts, systematic, strict=True):
+        share = own.trusted_share(typical_albedo, error)
+        whole.sums += own.sums * np.tile(share, PRODUCTS)
+        whole.clipped_ee += own.clipped_ee * share
+        left += np.square(own.ee * share) * error
+    return Evidence(whole, information, left / np.maximum(np.square(whole.ee), 1e-12))
+
+
+class BorderSums:
+    """How near its border the head shows each of T texels, over the frames: sums [2, T] of samples and weights.
+    error_mm: how far the surface may be off."""
+
+    def __init__(self, texels: int, error_mm: float):
+        self.sums, self.error = np.zeros((2, texels), np.float32), max(error_mm, LEAST_BORDER_MM) / (0.5 * BALL_MM)
+
+    def add(self, samples: TexelSamples) -> None:
+        """One frame; weights are squared cosines of the view, less near the mask's border."""
+        self.sums[0, samples.rows] += 1.0
+        self.sums[1, samples.rows] += samples.weight
+
+    def variance(self) -> np.ndarray:
+        """[T] of the log albedo. At a view cosine c the border is BALL_MM c^2 / 2 away: the outline's error over that
+        is the share of a sample that shows what lies behind, its mean over the frames weighted as the albedo is."""
+        count, weight = self.sums
+        return np.square(self.error * count / np.maximum(weight, 1e-3))
+
+
+@compiled
+def _add_samples(
+    rows, weight, colours, saturation, irradiance, reflection, robust, shadow, absolute, relative, sums, clipped_ee
+):
+    for i in range(len(rows)):
+        row = rows[i]
+        for c in range(3):
+            colour, e, s = colours[i, c], irradiance[i, c], reflection[i, c]
+            sigma, border = absolute + relative * colour, shadow[i, c]
+            trust = weight[i] / (sigma * sigma + border * border)
+            weighted = trust * robust[i, c]
+            sums[row, c] += weighted * e * e
+            sums[row, 3 + c] += weighted * e * s
+            sums[row, 6 + c] += weighted * e * colour
+            sums[row, 9 + c] += weighted * s * s
+            sums[row, 12 + c] += weighted * s * colour
+            sums[row, 18 + c] += weighted * border * border
+            if saturation[i, c] == 0:
+                sums[row, 15 + c] += weighted * e * e
+            elif saturation[i, c] > 0:
+                clipped_ee[row, c] += trust * e * e
+
+
+def robust_weight(
+    model: np.ndarray,
+    samples: TexelSamples,
+    noise: Noise,
+    information: np.ndarray,
+    shadow: np.ndarray | None = None,
+    scale: float = 2.5,
+) -> np.ndarray:
+    """Cauchy weight [n, 3] of each sample given the model [n, 3]; 0 where a clipped or crushed sample's bound is
+    inactive.
+
+    information [T]: precision of the model's log albedo; what it leaves open is no reason to distrust a sample; shadow
+    [n, 3]: standard deviation of the model since borders of shadows may lie elsewhere; None: of none.
+    """
+    shadow, weight = np.zeros_like(model) if shadow is None else shadow, np.empty_like(model)
+    numbers = np.array([noise.absolute, noise.relative, PRIOR_SPREAD**-2, scale**-2], np.float32)
+    _weigh_samples(model, samples.colours, samples.saturation, samples.rows, information, shadow, numbers, weight)
+    return weight
+
+
+_is_inactive = compiled(is_inactive)
+
+
+@compiled
+def _weigh_samples(model, colours, saturation, rows, information, shadow, numbers, weight):
+    absolute, relative, prior, tightness = numbers
+    for i in range(len(model)):
+        openness = np.float32(1.0) / (information[rows[i]] + prior)
+        for c in range(3):
+            error, sigma = model[i, c] - colours[i, c], absolute + relative * colours[i, c]
+            if _is_inactive(saturation[i, c], error):
+                weight[i, c] = 0.0
+                continue
+            variance = sigma * sigma + model[i, c] * model[i, c] * openness + shadow[i, c] * shadow[i, c]
+            weight[i, c] = variance / (variance + tightness * error * error)
+
+
+def pooled_specular(
+    surface: TexelSurface, equations: NormalEquations, width: float, mean: float, sigma: float
+) -> np.ndarray:
+    """Intensity [T]: the equations summed over a Gaussian of width texels, with a normal prior.
+
+    Infinite width: one value everywhere, the prior's mean.
+    """
+    if not np.isfinite(width):
+        return np.full(len(surface), mean, np.float32)
+    curvature, moment = equations.specular_equations()
+    spread = [_blurred(surface.to_image(x / CORRELATED_FRAMES), width) for x in (curvature, moment)]
+    curvature, moment = (image.ravel()[surface.pixel] for image in spread)
+    value = (POOL * moment + mean / sigma**2) / (POOL * curvature + 1.0 / sigma**2)
+    return np.clip(value, 0.0, 2.0).astype(np.float32)
+
+
+def _blurred(image: np.ndarray, width: float) -> np.ndarray:
+    """A Gaussian of width texels over the image [S, S]. Wide ones pass over means of blocks, a fourth as wide at most,
+    which widens them by less than 1 %."""
+    block = 1
+    while 8 * block <= width and image.shape[0] % (2 * block) == 0:
+        block *= 2
+    size = image.shape[0] // block
+    means = image.reshape(size, block, size, block).mean((1, 3))
+    return cv2.resize(gaussian_filter(means, width / block), image.shape, interpolation=cv2.INTER_LINEAR)

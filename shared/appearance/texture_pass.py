@@ -1,0 +1,233 @@
+"""The frames through the texture's normal equations: some for a first look, all to fit, held-out ones to choose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from shared.appearance.texture import (
+    IRRADIANCE_ERROR,
+    NORMAL_ERROR,
+    PRIOR_SPREAD,
+    BorderSums,
+    Evidence,
+    Noise,
+    NormalEquations,
+    TexelMaterial,
+    pooled_specular,
+    robust_weight,
+    weigh_lights,
+)
+from shared.compute.read_ahead import read_ahead
+from shared.compute.threads import share_out
+from shared.imaging.frame_index import frames_of_lights, spread_frames
+from shared.imaging.image_sampling import Picture, SurfaceViewer, is_inactive
+from shared.imaging.texels import FrameView, TexelSamples, TexelSurface, smooth_field
+from shared.rendering.shading import VertexShading
+
+Result = TypeVar("Result")
+
+_ALBEDO_PULL = 10.0
+NEIGHBOUR_STEP, SURROUNDINGS_SPREAD = 0.05, 3.0
+"""Standard deviations of the log albedo: from one vertex to the next, and from the person's typical skin."""
+FIRST_PASS_FRAMES = 32
+"""Enough to tell what a texel looks like, so that every frame's samples can be weighed by it."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """The frames as the pass reads them: picture(f) for f in range(F), poses [F, 4, 4], intrinsics of the pictures,
+    [3, 3] or [F, 3, 3], fitted [F] bool; the others are held out; light_index [F]: each frame's light, None: one."""
+
+    picture: Callable[[int], Picture]
+    camera_from_head: np.ndarray
+    intrinsics: np.ndarray
+    fitted: np.ndarray
+    light_index: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class LitSamples:
+    """Samples of a frame with E, S and the standard deviation of a typical albedo's radiance by the borders of shadows
+    [n, 3] at them."""
+
+    samples: TexelSamples
+    irradiance: np.ndarray
+    reflection: np.ndarray
+    shadow: np.ndarray
+
+    def model(self, material: TexelMaterial) -> np.ndarray:
+        """The radiance [n, 3] that the material gives them."""
+        return material.radiance(self.samples.rows, self.irradiance, self.reflection)
+
+
+class TexturePass:
+    """Per-texel albedo and specular intensity under a fixed light, roughness and geometry.
+
+    specular: the clip's one intensity or each texel's [T], the prior's mean; typical_albedo [3]; sigma: how far a texel
+    may leave it;
+    light_weights: how much samples of each light count, by how well the model follows it; empty: all alike;
+    region [V]: parts of the head, skin and hair, of which one says nothing of the other.
+    """
+
+    def __init__(
+        self,
+        surface: TexelSurface,
+        viewer: SurfaceViewer,
+        shading: VertexShading,
+        clip: Clip,
+        specular: float | np.ndarray,
+        typical_albedo: np.ndarray,
+        sigma: float = 0.25,
+        noise: Noise | None = None,
+        light_weights: Sequence[float] = (),
+        region: np.ndarray | None = None,
+        progress: Callable = lambda items, label: items,
+    ):
+        self.surface, self.viewer, self.shading, self.clip = surface, viewer, shading, clip
+        self.typical_albedo = typical_albedo
+        self.intrinsics = np.broadcast_to(clip.intrinsics, (len(clip.fitted), 3, 3))
+        self.light_index = np.zeros(len(clip.fitted), int) if clip.light_index is None else clip.light_index
+        lights = frames_of_lights(self.light_index, len(clip.fitted))
+        self.light_weights = tuple(light_weights) or (1.0,) * len(lights)
+        self.systematic = [self._systematic(own) / trust for own, trust in zip(lights, self.light_weights, strict=True)]
+        self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), progress
+        self.region = region
+
+    def _systematic(self, frames: np.ndarray) -> np.ndarray:
+        """[T, 3]: variance of the log albedo that all frames of one light share."""
+        surface, shading = self.surface, self.shading
+        mean = np.maximum(surface.interpolate(shading.mean_irradiance(frames)), 1e-6)
+        turned = NORMAL_ERROR * surface.interpolate(shading.mean_slope(frames)) / mean
+        return np.square(IRRADIANCE_ERROR * np.median(mean, axis=0) / mean) + np.square(turned)
+
+    def run(self, widths: tuple[float, ...]) -> tuple[TexelMaterial, dict]:
+        """Both passes -> the material, and a record of what the held-out frames said to each pooling width."""
+        count = len(self.surface)
+        mean = np.full(count, self.specular, np.float32)
+        fitted = np.nonzero(self.clip.fitted)[0]
+        some = fitted[spread_frames(len(fitted), FIRST_PASS_FRAMES, self.light_index[fitted])]
+        (first,) = self._close(self._accumulate(None, some, "texture, first pass"), [mean])
+        evidence = self._accumulate(first, fitted, "texture, second pass")
+        pooled = [
+            pooled_specular(self.surface, evidence.equations, width, mean=self.specular, sigma=self.sigma)
+            for width in widths
+        ]
+        candidates = self._close(evidence, pooled)
+        errors = self.held_out_errors(candidates)
+        best = int(np.argmin(errors))
+        names = ["one value" if not np.isfinite(width) else f"{width:g} texels" for width in widths]
+        record = {"held_out": dict(zip(names, errors, strict=True)), "chosen": names[best]}
+        return candidates[best], record
+
+    def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> Evidence:
+        parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]
+        borders = [BorderSums(len(self.surface), self.viewer.error_mm) for _ in self.systematic]
+        ahead = read_ahead(map(self.view, self.progress(frames, label)))
+        for f, view in zip(frames, ahead, strict=True):
+            part, border = parts[self.light_index[f]], borders[self.light_index[f]]
+            self._share_out(view, lambda lit, part=part, border=border: self._add(material, part, border, lit))
+        for part, trust in zip(parts, self.light_weights, strict=True):
+            part.scale(trust)
+        systematic = [error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
+                      + part.highlight_variance(self.specular)
+                      for error, border, part in zip(self.systematic, borders, parts, strict=True)]
+        return weigh_lights(parts, systematic, self.typical_albedo)
+
+    def view(self, f: int) -> FrameView:
+        """One frame with the values that LitSamples takes."""
+        clip, shading = self.clip, self.shading
+        pose, picture, lens = clip.camera_from_head[f], clip.picture(f), self.intrinsics[f]
+        view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
+        shadow = shading.shadow_uncertainty(f) * self.typical_albedo.astype(np.float32)
+        values = np.concatenate([shading.irradiance(f), shading.reflection(f), shadow], axis=1)
+        return self.surface.frame_view(view, picture, lens, values)
+
+    def _share_out(self, view: FrameView, work: Callable[[LitSamples], Result]) -> list[Result]:
+        """work(samples) for each block of the frame's texels, on several threads -> the results in order."""
+        blocks = view.blocks()
+
+        def of_block(k: int) -> Result:
+            samples, found = self.surface.samples(view, blocks[k])
+            return work(LitSamples(samples, found[:, :3], found[:, 3:6], found[:, 6:]))
+
+        return share_out(len(blocks), of_block)
+
+    def _add(self, material: TexelMaterial | None, part: NormalEquations, border: BorderSums, lit: LitSamples) -> None:
+        """A block's samples to its light's sums; without a material every sample that is not at a limit counts."""
+        samples = lit.samples
+        if material is None:
+            robust = (samples.saturation == 0).astype(np.float32)
+        else:
+            robust = robust_weight(lit.model(material), samples, self.noise, material.information, lit.shadow)
+        part.add(samples, lit.irradiance, lit.reflection, robust, lit.shadow)
+        border.add(samples)
+
+    def _close(self, evidence: Evidence, intensities: list[np.ndarray]) -> list[TexelMaterial]:
+        """Albedo for each of some given intensities [T]; channels left open by the samples follow the others and the
+        neighbourhood."""
+        equations, information, systematic = evidence.equations, evidence.information, evidence.systematic
+        rough = [equations.solve_albedo(specular, 0.0, 1e-6) for specular in intensities]
+        around = self._surroundings(rough, information).astype(np.float32)
+        certain = information / (1.0 + information)
+        trusted = (PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + systematic)).mean(1)
+        pull = _ALBEDO_PULL + equations.ee * (systematic / PRIOR_SPREAD**2)
+        found = []
+        for k, specular in enumerate(intensities):
+            smooth = np.exp(self.surface.interpolate(around[..., k]))
+            # A texel's brightness by its certain channels, its colour otherwise the neighbourhood's.
+            brighter = (certain * np.log(np.maximum(rough[k], 1e-3) / smooth)).sum(1) / (certain.sum(1) + 0.3)
+            albedo = equations.solve_albedo(specular, smooth * np.exp(brighter * trusted)[:, None], pull)
+            found.append(TexelMaterial(albedo, specular, information.min(1)))
+        return found
+
+    def _surroundings(self, rough: list[np.ndarray], information: np.ndarray) -> np.ndarray:
+        """[V, 3, K] log albedo as smooth fields, of K results [T, 3]: texels that the clip tells little of follow
+        those that it knows.
+
+        Brightness and colour are smooth each for itself, both relative to the person's typical skin: a channel that is
+        clipped everywhere takes its brightness from the others that are not, its tint from where all are known.
+        """
+        typical = np.log(np.maximum(self.typical_albedo, 1e-3)).astype(np.float32)
+        precision = np.minimum(information, NEIGHBOUR_STEP**-2)
+        total = np.maximum(precision.sum(1, keepdims=True), 1e-12)
+        share = precision / total
+        tint_precision = precision * (1.0 - share)
+        brightness, tint = [], []
+        for albedo in rough:
+            relative = np.log(np.maximum(albedo, 1e-3)) - typical
+            level = (share * relative).sum(1, keepdims=True)
+            brightness.append(self.surface.to_vertices(level, total)[0])
+            tint.append(self.surface.to_vertices(relative - level, tint_precision)[0])
+        tint_field = self._field(np.stack(tint, axis=-1), tint_precision)
+        return typical[:, None] + self._field(np.stack(brightness, axis=-1), total) + tint_field
+
+    def _field(self, means: np.ndarray, precision: np.ndarray) -> np.ndarray:
+        """Vertex values [V, C, K], means of texels of some precision [T, C] -> the smooth fields [V, C, K] through
+        them; 0 far from any."""
+        share, _ = self.surface.to_vertices(precision, np.ones_like(precision))
+        # What leaves a texel as open as the prior does is mostly a model's error that its neighbours share.
+        known = share**2 / (share + PRIOR_SPREAD**-2)
+        centre = np.zeros(precision.shape[1])
+        return smooth_field(self.surface.mesh, means, known, centre, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD, self.region)
+
+    def held_out_errors(self, candidates: list[TexelMaterial]) -> list[float]:
+        """Root mean square residual of each candidate on the held-out frames (linear, censored, trust-weighted)."""
+        sums = np.zeros(1 + len(candidates))
+        frames = self.progress(np.nonzero(~self.clip.fitted)[0], "texture, held-out frames")
+        for view in read_ahead(map(self.view, frames)):
+            sums += sum(self._share_out(view, lambda lit: _squared_errors(candidates, lit)))
+        return [float(value) for value in np.sqrt(sums[1:] / max(3.0 * sums[0], 1e-9))]
+
+
+def _squared_errors(candidates: list[TexelMaterial], lit: LitSamples) -> np.ndarray:
+    """The samples' total weight and each candidate's sum of squared residuals."""
+    samples, sums = lit.samples, [lit.samples.weight.sum()]
+    for material in candidates:
+        error = lit.model(material) - samples.colours
+        error[is_inactive(samples.saturation, error)] = 0.0
+        sums.append((samples.weight[:, None] * np.minimum(error**2, 0.01)).sum())
+    return np.array(sums, float)

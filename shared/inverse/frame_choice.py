@@ -1,0 +1,33 @@
+"""Few frames that together show as much of the face as they can: how methods work that fit single pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shared.imaging.frame_index import spread_frames
+from shared.imaging.image_sampling import SurfaceViewer
+
+CANDIDATES = 60
+
+
+def covering_frames(
+    viewer: SurfaceViewer,
+    wanted: np.ndarray,
+    camera_from_head: np.ndarray,
+    intrinsics: np.ndarray,
+    size: tuple[int, int],
+    count: int,
+) -> np.ndarray:
+    """[count] indices into the poses [F, 4, 4]: greedily those that add most to the best view of each vertex.
+
+    wanted [V] bool: vertices that count, each by the square of its view cosine where it is seen.
+    """
+    candidates = spread_frames(len(camera_from_head), CANDIDATES)
+    views = [viewer.view(camera_from_head[f], intrinsics, size).weight[wanted] for f in candidates]
+    weight, best, chosen = np.stack(views), np.zeros(int(wanted.sum()), np.float32), []
+    for _ in range(min(count, len(candidates))):
+        gain = np.maximum(weight, best).sum(1)
+        gain[chosen] = -1.0
+        chosen.append(int(gain.argmax()))
+        best = np.maximum(best, weight[chosen[-1]])
+    return np.sort(candidates[chosen])

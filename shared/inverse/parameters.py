@@ -1,0 +1,96 @@
+"""The parameters of inverse_render as its solvers' settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from shared.appearance.light import LightPriors
+from shared.appearance.skin_prior import SkinVariation
+from shared.appearance.solver import AppearanceSettings
+from shared.contract.job import Parameters
+from shared.contract.wording import unknown_name
+from shared.errors import InputError
+from shared.inverse.problem import InverseSettings
+from shared.published.settings import ReferenceSettings, Weights
+from shared.published.shading import Sampling
+from shared.rendering.precomputed_transfer import Sizes
+from shared.selection.candidates import PARTS
+from shared.shape.gauss_newton import ShapeSettings
+
+SPECULAR_SPREAD = 0.25
+"""Standard deviation of the logarithm of people's mean specular intensity about the expected one."""
+
+
+def read_settings(params: Parameters, checkpoint: Path | None = None) -> InverseSettings:
+    """All settings; checkpoint: the reference solver's own file, or None. InputError for what cannot go together."""
+    if params.model == "auto" and params.solver == "reference":
+        raise InputError("model=auto belongs to solver=transfer", where="--set inverse_render.model",
+                         hint="leave out one of the two; the reference solver takes visibility and specular as given")
+    appearance = AppearanceSettings(
+        light_model=params.light_model,
+        resolutions=tuple(n for n in (8, 16, 32) if n <= params.light_resolution) or (params.light_resolution,),
+        steps=params.light_steps,
+        independent=params.independent_samples,
+        priors=LightPriors(smooth=params.light_smoothness),
+        white_sigma=params.light_colour_sigma,
+        skin=SkinVariation(params.skin_brightness_sigma, params.skin_colour_sigma),
+        visibility=params.visibility,
+        bounce=params.bounce,
+        specular=params.specular,
+        roughness=params.roughness,
+        fit_roughness=params.fit_roughness,
+        local_roughness=params.local_roughness,
+        specular_prior=(params.specular_prior, SPECULAR_SPREAD),
+    )
+    contour = {} if params.silhouette else {"contour": None}
+    shape = ShapeSettings(
+        subdivisions=params.shape_subdivisions,
+        rounds=params.shape_rounds,
+        frames=params.shape_frames,
+        smoothness=params.shape_smoothness,
+        sigma_mm=params.shape_sigma,
+        **contour,
+    )
+    return InverseSettings(
+        sizes=Sizes(params.points, params.directions, params.bounce_nodes),
+        appearance=appearance,
+        light_frames=params.light_frames,
+        map_size=params.map_size,
+        hold_out_every=params.hold_out_every,
+        shape=shape if params.shape else None,
+        fit_frames=params.fit_frames,
+        normal_map=params.normal_map,
+        reference=read_reference(params, checkpoint) if params.solver == "reference" else None,
+        selection=read_forced(params.fixed_parts) if params.model == "auto" else None,
+    )
+
+
+def read_forced(text: str) -> frozenset[str]:
+    """Parts of the model that are not chosen; InputError for one that there is not."""
+    forced = frozenset(filter(None, (name.strip() for name in text.split(","))))
+    for name in sorted(forced.difference(PARTS)):
+        raise unknown_name("part of the model", name, PARTS, "--set inverse_render.fixed_parts")
+    return forced
+
+
+def read_reference(params: Parameters, checkpoint: Path | None = None) -> ReferenceSettings:
+    """The reference solver's settings; InputError where the device is absent."""
+    prefix, given = "reference_", params.as_dict()
+    own = {name.removeprefix(prefix): value for name, value in given.items() if name.startswith(prefix)}
+    if own["device"] == "cuda" and not torch.cuda.is_available():
+        raise InputError("no such device here", where="--set inverse_render.reference_device", got="cuda",
+                         hint="take cpu, or a machine and a build of torch with CUDA")
+    samples = {name: own.pop(f"{name}_samples") for name in ("light", "cosine", "lobe")}
+    weights = {name: own.pop(name) for name in ("mask", "laplacian", "white_light", "roughness_variation", "diffuse")}
+    return ReferenceSettings(
+        sampling=Sampling(**samples, visibility=params.visibility, specular=params.specular),
+        weights=Weights(**weights),
+        resolution=own.pop("light_resolution"),
+        roughness=params.roughness,
+        light_model=params.light_model,
+        seed=params.seed,
+        checkpoint=checkpoint,
+        **own,
+    )

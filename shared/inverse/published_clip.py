@@ -1,0 +1,220 @@
+"""A clip through the reference solver: its start, its checkpoint, and its result in the transfer solver's terms."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from shared.appearance.albedo_scale import most_likely_irradiance
+from shared.appearance.chart_scale import describe_scale
+from shared.appearance.fit import Solution
+from shared.appearance.light_models import LogLight
+from shared.appearance.maps import make_maps
+from shared.appearance.solver import AppearanceState
+from shared.appearance.texture import TexelMaterial
+from shared.errors import InputError
+from shared.imaging.frame_index import spread_frames
+from shared.imaging.image_sampling import SurfaceViewer
+from shared.imaging.texels import TexelSurface
+from shared.inverse.problem import FACE_SKIN, InverseResult, InverseSettings, segment_vertices, shade_vertices
+from shared.io.arrays import load_arrays, save_arrays
+from shared.published.settings import ReferenceSettings
+from shared.published.solver import ReferenceSolver, Start, Views
+from shared.rendering.precomputed_transfer import precompute_transfer
+
+START_FRAMES, JUDGED_FRAMES, JUDGED_PIXELS = 32, 6, 2000
+LARGEST_RESULT_LIGHT = 64
+SAMPLE_SPREAD = 0.04
+"""Relative standard deviation of one sample: what the confidence map counts with."""
+REPORT_EVERY = 50
+SCALE = "priors on skin and white light where the descent starts, which nothing holds it to"
+
+
+@dataclass(frozen=True)
+class Average:
+    """The frames' mean colours at a map's texels [T, 3] and the sum of their weights [T]."""
+
+    surface: TexelSurface
+    colours: np.ndarray
+    weight: np.ndarray
+
+
+def average_texture(inputs, viewer: SurfaceViewer, size: int, frames: np.ndarray, progress: Callable) -> Average:
+    """Weighted mean of what some frames show of each texel; unseen texels take the median colour."""
+    surface = TexelSurface(viewer.mesh, size)
+    total, weight = np.zeros((len(surface), 3)), np.zeros(len(surface))
+    for f in progress(frames, "mean texture"):
+        picture = inputs.picture(f)
+        view = viewer.view(inputs.camera_from_head[f], inputs.intrinsics, picture.inside.shape[::-1])
+        samples, _ = surface.samples(surface.frame_view(view, picture, inputs.intrinsics))
+        total[samples.rows] += samples.weight[:, None] * samples.colours
+        weight[samples.rows] += samples.weight
+    seen = weight > 1e-3
+    if not seen.any():
+        raise InputError("no frame shows the mesh", where="poses", hint="check the poses and the mesh")
+    colours = np.where(
+        seen[:, None], total / np.maximum(weight, 1e-9)[:, None], np.median(total[seen] / weight[seen, None], axis=0)
+    )
+    return Average(surface, np.maximum(colours, 1e-3), weight)
+
+
+def make_start(average: Average, skin: np.ndarray, white_sigma: float, specular: bool) -> Start:
+    """The mean texture under a uniform light of the level that the priors on skin prefer; skin [V] bool.
+
+    The specular intensity starts as the grey of the albedo, as published.
+    """
+    surface = average.surface
+    on_skin = skin[surface.mesh.faces[surface.face]].all(1) & (average.weight > 1e-3)
+    radiance = np.median(average.colours[on_skin] if on_skin.any() else average.colours, axis=0)
+    irradiance = np.exp(most_likely_irradiance(np.log(radiance), white_sigma))
+    albedo = np.clip(average.colours / irradiance, 0.0, 1.0)
+    grey = albedo.mean(1) if specular else np.zeros(len(albedo))
+    albedo, grey = (surface.dilated(surface.to_image(values.astype(np.float32))) for values in (albedo, grey))
+    return Start(irradiance, albedo, grey)
+
+
+def solve_by_reference(
+    inputs,
+    settings: InverseSettings,
+    reference: ReferenceSettings,
+    fitted: np.ndarray,
+    progress: Callable,
+    note: Callable,
+    observe: Callable[[ReferenceSolver, dict], None] = lambda solver, record: None,
+) -> InverseResult:
+    """As inverse.solve_clip. fitted [F] bool; observe(solver, losses) after each iteration."""
+    mesh = inputs.mesh
+    viewer = SurfaceViewer.of(mesh)
+    index = np.nonzero(fitted)[0]
+    some = index[spread_frames(len(index), START_FRAMES)]
+    average = average_texture(inputs, viewer, settings.map_size, some, progress)
+    skin = segment_vertices(inputs, FACE_SKIN)
+    start = make_start(average, skin, settings.appearance.white_sigma, reference.sampling.specular)
+    moves = settings.appearance.light_moves(inputs.moves)
+    views = Views(
+        lambda k: inputs.picture(int(index[k])), inputs.camera_from_head[index], inputs.intrinsics, inputs.size, moves
+    )
+    solver = ReferenceSolver(mesh, views, start, reference)
+    checkpoint = Checkpoint(reference, start, views)
+    checkpoint.load(solver, note)
+    records = []
+    for i in progress(range(solver.iteration, reference.iterations), "reference iterations"):
+        losses = solver.step()
+        observe(solver, losses)
+        records.append(losses)
+        if (i + 1) % REPORT_EVERY == 0 or i + 1 == reference.iterations:
+            mean = {name: float(np.mean([r[name] for r in records[-REPORT_EVERY:]])) for name in losses}
+            note(f"iteration {i + 1}: " + ", ".join(f"{name} {value:.5f}" for name, value in mean.items()))
+        checkpoint.save(solver)
+    result = conclude(inputs, settings, solver, average, fitted, records, progress)
+    checkpoint.remove()
+    return result
+
+
+class Checkpoint:
+    """The solver's arrays in one file, with a key of settings and inputs: others' checkpoints are passed over."""
+
+    def __init__(self, settings: ReferenceSettings, start: Start, views: Views):
+        self.path, self.every = settings.checkpoint, settings.checkpoint_every
+        same = replace(settings, checkpoint=None, checkpoint_every=0, iterations=0, device="")
+        digest = hashlib.sha256(repr(same).encode())
+        for array in (start.albedo, start.specular_intensity, start.radiance, views.camera_from_head, views.intrinsics):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        self.key = np.frombuffer(digest.digest(), np.uint8)
+
+    def load(self, solver: ReferenceSolver, note: Callable) -> None:
+        """Goes on from the file where it belongs to this work."""
+        if self.path is None or not Path(self.path).is_file():
+            return
+        try:
+            arrays = load_arrays(self.path)
+        except InputError as error:
+            note(f"starts anew: {error}")
+            return
+        if not np.array_equal(arrays.pop("key", None), self.key):
+            note(f"starts anew: {self.path} is a checkpoint of other settings or inputs")
+            return
+        solver.restore(arrays)
+        note(f"goes on from iteration {solver.iteration} of {self.path}")
+
+    def save(self, solver: ReferenceSolver) -> None:
+        """Every so many iterations, whole or not at all."""
+        if self.path is None or solver.iteration % self.every:
+            return
+        unfinished = Path(f"{self.path}.partial")
+        save_arrays(unfinished, key=self.key, **solver.arrays())
+        unfinished.replace(self.path)
+
+    def remove(self) -> None:
+        """Done: nothing to go on from."""
+        if self.path is not None:
+            Path(self.path).unlink(missing_ok=True)
+
+
+def conclude(inputs, settings, solver: ReferenceSolver, average: Average, fitted, records, progress) -> InverseResult:
+    """The solver's state as maps, light and shading, for re-rendering by the shared renderer."""
+    surface, material = average.surface, map_material(solver, average)
+    moved = inputs.mesh.replace(vertices=solver.vertices().detach().cpu().double().numpy())
+    viewer = SurfaceViewer.of(moved)
+    roughness_map = solver.parameters["roughness"].detach().cpu().numpy()
+    skin = average.weight > 1e-3
+    roughness = float(np.median(roughness_map.reshape(-1)[surface.pixel][skin]))
+    maps = make_maps(surface, material, roughness)
+    maps["roughness"] = roughness_map.astype(np.float32)
+    appearance = replace(settings.appearance, bounce=False, visibility=solver.settings.sampling.visibility)
+    precomputed = precompute_transfer(viewer, settings.sizes, appearance.visibility)
+    state = final_state(solver, material, roughness, len(precomputed.nodes.points))
+    fit = residual(inputs, solver, np.nonzero(fitted)[0])
+    held = fit if fitted.all() else residual(inputs, solver, np.nonzero(~fitted)[0])
+    solution = Solution(state, tuple(_thinned(records)), fit, held)
+    shading = shade_vertices(inputs, appearance, viewer, precomputed, solution, progress)
+    record = {
+        "texture": {"held_out": {"per texel": held}, "chosen": "per texel"},
+        "albedo_scale": describe_scale(None, np.median(state.albedo, axis=0)) | {"method": SCALE},
+        "warnings": [],
+    }
+    return InverseResult(solution, material, maps, shading, viewer, fitted, record)
+
+
+def map_material(solver: ReferenceSolver, average: Average) -> TexelMaterial:
+    """The maps at their texels; information: the samples' weights over the variance of one."""
+    pixel = average.surface.pixel
+    albedo = solver.parameters["albedo"].detach().cpu().numpy().reshape(-1, 3)[pixel]
+    specular = solver.parameters["specular"].detach().cpu().numpy().reshape(-1)[pixel]
+    return TexelMaterial(albedo, specular, average.weight / SAMPLE_SPREAD**2)
+
+
+def final_state(solver: ReferenceSolver, material: TexelMaterial, roughness: float, nodes: int) -> AppearanceState:
+    """The light, made coarse enough for the transfer's renderer, and typical material."""
+    light = solver.light().detach().cpu().double().numpy()
+    edge = round((len(light) / 6) ** 0.5)
+    while edge > LARGEST_RESULT_LIGHT:
+        light = light.reshape(6, edge // 2, 2, edge // 2, 2, 3).mean((2, 4)).reshape(-1, 3)
+        edge //= 2
+    specular = float(np.median(material.specular))
+    typical = np.median(material.albedo[material.information > 1.0], axis=0)
+    params = np.log(np.maximum(light, 1e-6))
+    return AppearanceState(params, LogLight(edge), specular, roughness, material.albedo, np.tile(typical, (nodes, 1)))
+
+
+@torch.no_grad()
+def residual(inputs, solver: ReferenceSolver, frames: np.ndarray) -> float:
+    """Root mean square error (linear) of its own renders inside the mask, over a few of the frames."""
+    squared, generator, geometry = [], torch.Generator().manual_seed(0), solver.geometry()
+    for f in frames[spread_frames(len(frames), JUDGED_FRAMES)]:
+        picture, pose = inputs.picture(int(f)), inputs.camera_from_head[f]
+        hits = solver.raster.hits(geometry[2], pose)
+        seen = np.nonzero((hits.face.ravel() >= 0) & (picture.inside.ravel() > 0))[0]
+        seen = seen[spread_frames(len(seen), JUDGED_PIXELS)]
+        found = solver.shade(pose, seen, hits, geometry, generator).cpu().numpy()
+        squared.append(np.square(found - picture.levels[0].reshape(-1, 3)[seen]).mean())
+    return float(np.sqrt(np.mean(squared)))
+
+
+def _thinned(records: list[dict], most: int = 200) -> list[dict]:
+    return [{"iteration": int(i) + 1, **records[i]} for i in spread_frames(len(records), most)] if records else []

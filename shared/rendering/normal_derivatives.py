@@ -1,0 +1,143 @@
+"""Modelled radiance of surface points and how it changes when their normals turn.
+
+The direct irradiance over pi is n . W with the vector W = 4 / J sum_j V L_j w_j over the visible directions, so its
+derivative by the normal is W itself (with visibility held). Light that bounced is taken as it is: it comes from all
+sides. Reflections are differenced at anchors some millimetres apart and carried to the points between by the normal:
+
+    S_p = sum_a w_pa (S_a + G_a . (n_p - n_a))
+
+Reference: [Arvo1994] (the irradiance vector).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+import torch
+from scipy.spatial import cKDTree
+
+from shared.geometry.mesh import normalised, tangent_frames
+from shared.rendering.lobes import specular_reflection
+from shared.rendering.shading import VertexShading
+from shared.rendering.transfer import Points, position_and_normal, spread_vertices
+
+NORMAL_STEP = 0.06
+"""Radians between the normals whose reflections are differenced: half the spacing of 768 directions."""
+ANCHORS = 3000
+NEIGHBOURS, CLOSEST_MM = 4, 0.5
+
+
+@dataclass(frozen=True)
+class ShadingTerms:
+    """P points, F frames: irradiance E over pi and reflection S at specular_intensity 1, [P, F, 3] each, and their
+    derivatives irradiance_turn and reflection_turn [P, F, 3, 2] by a turn of the normal towards tangents [P, 2, 3];
+    shadow_slope [P, F, 3]: change of E per mm along the surface that the normal does not explain."""
+
+    tangents: np.ndarray
+    irradiance: np.ndarray
+    reflection: np.ndarray
+    irradiance_turn: np.ndarray
+    reflection_turn: np.ndarray
+    shadow_slope: np.ndarray
+
+
+class IrradianceVectors:
+    """W of P points: visible [P, J] bool, directions [J, 3], light_along [J, F, 3]."""
+
+    def __init__(self, visible: np.ndarray, directions: np.ndarray, light_along: np.ndarray):
+        self.visible = torch.from_numpy(visible.astype(np.float32))
+        self.directions, self.light_along = directions.astype(np.float32), light_along
+
+    def frames(self, frames: slice) -> np.ndarray:
+        """[P, n, 3 channels, 3] float32 in n of the frames."""
+        light = self.light_along[:, frames]
+        moments = light[..., None] * self.directions[:, None, None] * np.float32(4.0 / len(self.directions))
+        result = self.visible @ torch.from_numpy(moments.reshape(len(light), -1))
+        return result.numpy().reshape(len(self.visible), light.shape[1], 3, 3)
+
+
+class Reflections:
+    """S and its derivative by the normal, at rows [P] of the shading's points.
+
+    What is summed at the anchors is kept: after small moves the points' new normals are carried from the same anchors.
+    """
+
+    def __init__(self, shading: VertexShading, rows: np.ndarray):
+        self.shading, points = shading, shading.points
+        self.anchors = rows[spread_vertices(points.positions[rows], ANCHORS)]
+        self.normals = points.normals[self.anchors]
+        self.tangents = tangent_frames(self.normals)
+        table = shading.table.take(self.anchors)
+        turned = [table.turned(normalised(self.normals + NORMAL_STEP * self.tangents[:, k])) for k in range(2)]
+        self.tables = [table, *turned]
+        near = cKDTree(position_and_normal(points.take(self.anchors)))
+        distance, which = near.query(position_and_normal(points.take(rows)), k=min(4, len(self.anchors)))
+        weight = 1.0 / (distance + 0.3) ** 2
+        weight /= weight.sum(1, keepdims=True)
+        entries = np.repeat(np.arange(len(rows)), which.shape[1]), which.ravel()
+        self._known: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self.carry = sparse.csr_matrix((weight.ravel(), entries), (len(rows), len(self.anchors)))
+
+    def at(
+        self, frame: int, normals: np.ndarray, rows: slice | np.ndarray = slice(None)
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """S [n, 3] of some of the P points with normals [n, 3] and its derivative by them [n, 3 channels, 3]."""
+        if frame not in self._known:
+            self._known[frame] = self._at_anchors(frame)
+        value, slope = self._known[frame]
+        level = value - np.einsum("acx,ax->ac", slope, self.normals)
+        both = self.carry[rows] @ np.concatenate([level, slope.reshape(-1, 9)], axis=1)
+        slope = both[:, 3:].reshape(-1, 3, 3)
+        return np.maximum(both[:, :3] + np.einsum("pcx,px->pc", slope, normals), 0.0), slope
+
+    def _at_anchors(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        shading = self.shading
+        towards, blocked = shading.towards_camera(frame)[self.anchors], shading.blocked_light(frame)[self.anchors]
+        facing = np.nonzero((towards * self.normals).sum(1) > -0.1)[0]
+        light = shading.light_along[:, frame]
+        roughness = shading.roughness_of(self.anchors[facing])
+        values = [
+            specular_reflection(table.take(facing), towards[facing], roughness, light, blocked[facing])
+            for table in self.tables
+        ]
+        value, slope = np.zeros((len(self.anchors), 3)), np.zeros((len(self.anchors), 3, 3))
+        value[facing] = values[0]
+        for k in range(2):
+            change = (values[1 + k] - values[0]) / NORMAL_STEP
+            slope[facing] += change[:, :, None] * self.tangents[facing, k][:, None]
+        return value, slope
+
+
+def shading_terms(shading: VertexShading, rows: np.ndarray, reflections: Reflections | None) -> ShadingTerms:
+    """Terms of the shading's points rows [P] in all its frames; reflections: of all its points, None: there are none.
+    """
+    normals = shading.points.normals[rows]
+    tangents = tangent_frames(normals).astype(np.float32)
+    vectors = IrradianceVectors(shading.transfer.visibility(rows), shading.directions, shading.light_along)
+    along = vectors.frames(slice(None))
+    turn = np.einsum("pfcx,pkx->pfck", along, tangents)
+    shadow = shadow_slope(shading.points.take(rows), along)
+    shape = (len(rows), shading.light_along.shape[1], 3)
+    reflection, reflection_turn = np.zeros(shape, np.float32), np.zeros(shape + (2,), np.float32)
+    if reflections is not None:
+        for f in range(shape[1]):
+            reflection[:, f], slope = reflections.at(f, normals, rows)
+            reflection_turn[:, f] = np.einsum("pcx,pkx->pck", slope, tangents)
+    return ShadingTerms(tangents, shading.irradiance_of_points(rows), reflection, turn, reflection_turn, shadow)
+
+
+def shadow_slope(points: Points, vectors: np.ndarray) -> np.ndarray:
+    """[P, F, 3]: rms change of n . W per mm towards the nearest points, n held: where the borders of cast shadows lie.
+
+    vectors [P, F, 3 channels, 3]: W. Where a border lies is known no better than visibility and shape are.
+    """
+    distance, near = cKDTree(points.positions).query(points.positions, k=min(1 + NEIGHBOURS, len(points)))
+    total = np.zeros(vectors.shape[:3], np.float32)
+    for k in range(1, near.shape[1]):
+        between = normalised(points.normals + points.normals[near[:, k]]).astype(np.float32)
+        change = np.einsum("pfcx,px->pfc", vectors[near[:, k]] - vectors, between)
+        total += np.square(change / np.maximum(distance[:, k], CLOSEST_MM)[:, None, None].astype(np.float32))
+    return np.sqrt(total / NEIGHBOURS)
+

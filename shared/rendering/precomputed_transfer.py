@@ -1,0 +1,48 @@
+"""Precomputed transfer of a mesh: the part of its shading that no frame and no light changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.geometry.raycast import RayScene
+from shared.geometry.transforms import fibonacci_sphere
+from shared.imaging.image_sampling import SurfaceViewer
+from shared.rendering.transfer import Nodes, Points, Transfer, bounce_nodes, trace_transfer
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """points on the surface, directions over the sphere, nodes that bounce light."""
+
+    points: int = 4000
+    directions: int = 768
+    nodes: int = 1000
+
+
+@dataclass(frozen=True)
+class PrecomputedTransfer:
+    """What does not depend on the frames: directions [J, 3], bounce nodes and their transfer, whether parts of the
+    head cover each other."""
+
+    scene: RayScene
+    directions: np.ndarray
+    nodes: Nodes
+    node_transfer: Transfer
+    visibility: bool = True
+
+    def trace(self, points: Points, progress: Callable = iter) -> Transfer:
+        """The transfer of surface points along the directions."""
+        return trace_transfer(
+            self.scene, points, self.nodes, self.directions, progress=progress, visibility=self.visibility
+        )
+
+
+def precompute_transfer(viewer: SurfaceViewer, sizes: Sizes, visibility: bool = True) -> PrecomputedTransfer:
+    """Directions and bounce nodes of a mesh, traced; visibility off: see trace_transfer."""
+    directions = fibonacci_sphere(sizes.directions)
+    nodes = bounce_nodes(viewer.mesh, sizes.nodes, viewer.layout)
+    node_transfer = trace_transfer(viewer.scene, nodes.points, nodes, directions, visibility=visibility)
+    return PrecomputedTransfer(viewer.scene, directions, nodes, node_transfer, visibility)

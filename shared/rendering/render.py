@@ -1,0 +1,89 @@
+"""Re-renders a frame in image space from maps and the shading of the mesh's vertices.
+
+Primary rays find the surface; albedo and specular intensity come from the maps, irradiance and the specular lobe sum
+from the vertices, interpolated over the triangles. Several rays per pixel share one shading, so edges are smooth and
+the picture can be compared with a camera's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.compute.compiled import compiled
+from shared.geometry.raycast import camera_hits
+from shared.imaging.image_sampling import SurfaceViewer
+from shared.rendering.shading import VertexShading
+
+
+@dataclass(frozen=True)
+class SurfaceMaps:
+    """UV-space maps: albedo [S, S, 3] and specular_intensity [S, S]."""
+
+    albedo: np.ndarray
+    specular_intensity: np.ndarray
+
+
+def render_frame(
+    viewer: SurfaceViewer,
+    shading: VertexShading,
+    maps: SurfaceMaps,
+    frame: int,
+    camera_from_head: np.ndarray,
+    intrinsics: np.ndarray,
+    size: tuple[int, int],
+    samples: int = 2,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Linear radiance [H, W, 3] and coverage [H, W] in [0, 1] of one frame; 0 outside the head.
+
+    size: (width, height); samples: rays per pixel along each axis. frame: the shading's frame. Radiance is the mean
+    over the rays that hit the head, so that partly covered pixels are not darkened.
+    """
+    width, height = size
+    mesh = viewer.mesh
+    shade = np.concatenate([shading.irradiance(frame), shading.reflection(frame)], axis=1)
+    shade, uvs = np.ascontiguousarray(shade, np.float32), mesh.uvs.astype(np.float32)
+    albedo = np.ascontiguousarray(maps.albedo, np.float32)
+    intensity = np.ascontiguousarray(maps.specular_intensity, np.float32)
+    radiance, hits = np.zeros((height * width, 3), np.float32), np.zeros(height * width, np.float32)
+    for row in range(samples):
+        for column in range(samples):
+            offsets = (column + 0.5) / samples, (row + 0.5) / samples
+            face, bary, _ = camera_hits(viewer.scene, camera_from_head, intrinsics, width, height, offsets)
+            _add_radiance(
+                face.ravel(), bary.reshape(-1, 3), mesh.faces, mesh.face_uvs, uvs, albedo, intensity, shade, radiance,
+                hits
+            )
+    radiance /= np.maximum(hits, 1.0)[:, None]
+    return radiance.reshape(height, width, 3), (hits / samples**2).reshape(height, width)
+
+
+@compiled
+def _add_radiance(face, bary, faces, face_uvs, uvs, albedo, specular_intensity, shade, radiance, hits):
+    """Adds to radiance [N, 3] and hits [N] what rays see: face [N] (-1: nothing), bary [N, 3]; shade [V, 6]: E and S;
+    maps as by texture.sample_bilinear."""
+    one, half, size = np.float32(1.0), np.float32(0.5), len(albedo)
+    for n in range(len(face)):
+        if face[n] < 0:
+            continue
+        hits[n] += one
+        u, v = np.float32(0.0), np.float32(0.0)
+        for k in range(3):
+            u += bary[n, k] * uvs[face_uvs[face[n], k], 0]
+            v += bary[n, k] * uvs[face_uvs[face[n], k], 1]
+        x, y = u * size - half, (one - v) * size - half
+        left, top = int(np.floor(x)), int(np.floor(y))
+        fx, fy = x - np.float32(left), y - np.float32(top)
+        right, bottom, left, top = (left + 1) % size, (top + 1) % size, left % size, top % size
+        corners = (one - fx) * (one - fy), fx * (one - fy), (one - fx) * fy, fx * fy
+        gloss = (corners[0] * specular_intensity[top, left] + corners[1] * specular_intensity[top, right]
+                 + corners[2] * specular_intensity[bottom, left] + corners[3] * specular_intensity[bottom, right])
+        for c in range(3):
+            diffuse = (corners[0] * albedo[top, left, c] + corners[1] * albedo[top, right, c]
+                       + corners[2] * albedo[bottom, left, c] + corners[3] * albedo[bottom, right, c])
+            irradiance, reflection = np.float32(0.0), np.float32(0.0)
+            for k in range(3):
+                irradiance += bary[n, k] * shade[faces[face[n], k], c]
+                reflection += bary[n, k] * shade[faces[face[n], k], c + 3]
+            radiance[n, c] += diffuse * irradiance + gloss * reflection

@@ -1,0 +1,231 @@
+"""Irradiance and reflection at a mesh's vertices in every frame, for the texture pass and for re-rendering.
+
+Vertices that no frame faces are left out; they, and those deep in a cavity, take what the nearest shaded vertex has. A
+fitted head is accurate to some tenths of a millimetre at best: between its lips or inside a nostril, where nearly all
+of the sky is covered, its own visibility says nothing, and would turn a closed mouth into a black slit.
+
+Irradiance (with bounces) of all frames is one product, kept as half floats (6 bytes per vertex and frame); lobe sums
+depend on the camera and are made for key frames, a few degrees of turn apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from shared.geometry.mesh import normalised
+from shared.geometry.transforms import camera_centres, vector_from_rotation, world_from_head
+from shared.rendering.brdf import hemispherical_albedo
+from shared.rendering.envmap import frame_lookup
+from shared.rendering.irradiance_errors import SHADOW_MM, irradiance_slope, shadow_uncertainty
+from shared.rendering.lobes import SpecularTransfer, specular_reflection
+from shared.rendering.transfer import Points, Transfer, bounced_irradiance, irradiance, node_radiosity
+
+KEY_STEP = 0.05
+"""Radians between frames whose lobe sums are computed (3 degrees)."""
+
+DEEP = 0.9
+"""Cosine-weighted share of the hemisphere that the head itself covers, from which on a point counts as in a cavity."""
+
+LARGEST_SHARE = 0.95
+"""Of the light that arrives, what a surface can send on: were it all of it, bounces would not end."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """What shading needs to know of the surface: for bounces node_albedo [K, 3], mean specular_intensity and roughness;
+    local_roughness [P] of the shaded points where it varies."""
+
+    node_albedo: np.ndarray
+    specular_intensity: float
+    roughness: float
+    local_roughness: np.ndarray | None = None
+
+    def bounce_albedo(self) -> np.ndarray:
+        """[K, 3] fraction of light that a node sends on, its specular share included as if it were diffuse; under 1 for
+        materials that no skin has, too."""
+        share = self.node_albedo + self.specular_intensity * hemispherical_albedo(round(self.roughness, 3))
+        return np.minimum(share, LARGEST_SHARE)
+
+
+class VertexShading:
+    """E and S of V vertices under a cubemap light in F frames.
+
+    index [P]: the vertices that are shaded, out of all, vertices [V, 3]; points, transfer [P]: theirs; node_transfer:
+    the nodes'; light [6 n^2, 3]; directions [J, 3]; camera_from_head [F, 4, 4]; moves: "head" or "camera"; bounce:
+    count light that bounced; key_step: largest turn between two frames whose reflections are computed, radians; deep:
+    covered share from which on a vertex takes what the nearest one in the open has; light_index [F]: which of several
+    lights, one below the other, each frame stands in, frames of one light in a row; None: there is one.
+    """
+
+    def __init__(
+        self,
+        index: np.ndarray,
+        vertices: np.ndarray,
+        points: Points,
+        transfer: Transfer,
+        node_transfer: Transfer,
+        material: Material,
+        light: np.ndarray,
+        directions: np.ndarray,
+        camera_from_head: np.ndarray,
+        moves: str,
+        bounce: bool = True,
+        key_step: float = KEY_STEP,
+        deep: float = DEEP,
+        light_index: np.ndarray | None = None,
+    ):
+        self.material, self.directions = material, directions
+        self.points, self.transfer = points, transfer
+        self.table = SpecularTransfer(points.normals, transfer.visibility(), directions)
+        self.stand_in = _stand_ins(vertices, index, transfer.blocked, deep)
+        self._node_direct = node_transfer.direct.astype(np.float32)
+        self._radiosity = node_radiosity(node_transfer, material.bounce_albedo()).astype(np.float32) if bounce else None
+        self._key_step = key_step
+        self._light(light, camera_from_head, moves, light_index)
+
+    def under(self, light: np.ndarray, camera_from_head: np.ndarray, moves: str) -> VertexShading:
+        """The same surface under one other light, in other frames."""
+        other = copy(self)
+        other._light(light, camera_from_head, moves, None)
+        return other
+
+    def _light(self, light, camera_from_head, moves, light_index) -> None:
+        self.light_along = light_along(light, self.directions, world_from_head(camera_from_head, moves), light_index)
+        shape = (len(self.points), len(camera_from_head), 3)
+        direct = irradiance(self.transfer, self.light_along.reshape(len(self.directions), -1))
+        bounces = self._radiosity is not None
+        bounced = bounced_irradiance(self.transfer, self._sent_by_nodes()) if bounces else np.zeros_like(direct)
+        total = direct + bounced
+        self._irradiance = total.reshape(shape).astype(np.float16)
+        self._bounced = (total - direct).reshape(shape).astype(np.float16)
+        self._centres = camera_centres(camera_from_head)
+        self._turn = turned_so_far(camera_from_head)
+        if light_index is not None:  # so that no frame lies between key frames of two lights
+            self._turn += 2.0 * np.pi * light_index
+        self._keys = key_frames(self._turn, self._key_step)
+        self._key_reflection: dict[int, np.ndarray] = {}
+        self._key_uncertainty: np.ndarray | None = None
+
+    def _sent_by_nodes(self) -> np.ndarray:
+        """[K, F * 3]: the nodes' radiosity over pi, with all diffuse bounces."""
+        channels = range(self.light_along.shape[-1])
+        sent = [self._radiosity[..., c] @ (self._node_direct @ self.light_along[..., c]) for c in channels]
+        return np.stack(sent, axis=-1).reshape(len(self._node_direct), -1)
+
+    def irradiance(self, frame: int) -> np.ndarray:
+        """E [V, 3] float32 over pi."""
+        return self._irradiance[:, frame].astype(np.float32)[self.stand_in]
+
+    def mean_irradiance(self, frames: slice | np.ndarray = slice(None)) -> np.ndarray:
+        """[V, 3] float32: E averaged over the frames, or over some of them."""
+        return self._irradiance[:, frames].mean(1, dtype=np.float32)[self.stand_in]
+
+    def mean_slope(self, frames: slice | np.ndarray = slice(None)) -> np.ndarray:
+        """[V, 3] float32: by how much the mean irradiance changes per radian that the normal turns, at most."""
+        light = self.light_along[:, frames].mean(1)
+        return irradiance_slope(self.transfer, self.points.normals, light, self.directions)[self.stand_in]
+
+    def reflection(self, frame: int) -> np.ndarray:
+        """S [V, 3] float32 at specular_intensity 1, between the two key frames around this one.
+
+        Lobes of skin are 20 degrees wide and more: linear interpolation over a turn of three is exact to 1 % of them.
+        """
+        return self._between_keys(frame, self._at_key)
+
+    def shadow_uncertainty(self, frame: int) -> np.ndarray:
+        """[V, 3] float32: standard deviation of E, given how far off the borders of shadows may be."""
+        if self._key_uncertainty is None:
+            light = self.light_along[:, self._keys].reshape(len(self.directions), -1)
+            uncertainty = shadow_uncertainty(self.points, self.transfer, light, self.directions, SHADOW_MM)
+            self._key_uncertainty = uncertainty.reshape(len(self.points), len(self._keys), 3).astype(np.float16)
+        return self._between_keys(frame, lambda key: self._key_uncertainty[:, np.searchsorted(self._keys, key)])
+
+    def _between_keys(self, frame: int, at_key: Callable[[int], np.ndarray]) -> np.ndarray:
+        """[V, 3] float32 of what at_key says [P, 3] of the two key frames around a frame."""
+        after = int(np.searchsorted(self._keys, frame))
+        high = int(self._keys[after])
+        low = high if high == frame else int(self._keys[after - 1])
+        share = (self._turn[frame] - self._turn[low]) / max(self._turn[high] - self._turn[low], 1e-12)
+        value = at_key(low).astype(np.float32)
+        if high != low:
+            value += np.float32(share) * (at_key(high).astype(np.float32) - value)
+        return value[self.stand_in]
+
+    def irradiance_of_points(self, rows: np.ndarray) -> np.ndarray:
+        """E [n, F, 3] float32 of some of the P points, each its own, in all frames."""
+        return self._irradiance[rows].astype(np.float32)
+
+    def roughness_of(self, rows: np.ndarray) -> float | np.ndarray:
+        """Of some of the P points: [n] where it varies."""
+        local = self.material.local_roughness
+        return self.material.roughness if local is None else np.maximum(local[rows], self.table.narrowest)
+
+    def towards_camera(self, frame: int) -> np.ndarray:
+        """[P, 3] unit vectors from the points to the camera."""
+        return normalised(self._centres[frame] - self.points.positions)
+
+    def blocked_light(self, frame: int) -> np.ndarray:
+        """[P, 3] float32: mean radiance of what of the head itself stands before the points."""
+        return self._bounced[:, frame].astype(np.float32) / np.maximum(self.transfer.blocked, 1e-3)[:, None]
+
+    def _at_key(self, frame: int) -> np.ndarray:
+        """S of the shaded vertices in one frame [P, 3], half floats; made once."""
+        if frame not in self._key_reflection:
+            towards, blocked = self.towards_camera(frame), self.blocked_light(frame)
+            facing = np.nonzero((towards * self.points.normals).sum(1) > -0.1)[0]
+            value = np.zeros((len(self.points), 3), np.float16)
+            value[facing] = specular_reflection(
+                self.table.take(facing),
+                towards[facing],
+                self.roughness_of(facing),
+                self.light_along[:, frame],
+                blocked[facing],
+            )
+            self._key_reflection[frame] = value
+        return self._key_reflection[frame]
+
+
+def _stand_ins(vertices: np.ndarray, index: np.ndarray, blocked: np.ndarray, deep: float) -> np.ndarray:
+    """[V]: for each vertex the place in index of the nearest shaded vertex in the open, its own where it is one."""
+    trusted = np.nonzero(blocked < deep)[0]
+    if len(trusted) == 0:
+        trusted = np.arange(len(index))
+    result = np.full(len(vertices), -1)
+    result[index[trusted]] = trusted
+    others = np.nonzero(result < 0)[0]
+    result[others] = trusted[cKDTree(vertices[index[trusted]]).query(vertices[others])[1]]
+    return result
+
+
+def turned_so_far(camera_from_head: np.ndarray) -> np.ndarray:
+    """[F, 4, 4] -> [F] angle that the head has turned against the camera from frame to frame, added up, radians."""
+    rotation = camera_from_head[:, :3, :3]
+    step = vector_from_rotation(np.einsum("fij,fkj->fik", rotation[1:], rotation[:-1]))
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(step, axis=1))])
+
+
+def key_frames(turn: np.ndarray, step: float) -> np.ndarray:
+    """Indices of frames no more than step apart in the accumulated turn [F] where frames are dense enough; the first
+    and the last are always among them."""
+    keys = [0]
+    for frame in range(1, len(turn)):
+        if turn[frame] - turn[keys[-1]] > step and frame - 1 > keys[-1]:
+            keys.append(frame - 1)
+    return np.unique([*keys, len(turn) - 1])
+
+
+def light_along(
+    light: np.ndarray, directions: np.ndarray, world_from_head: np.ndarray, light_index: np.ndarray | None = None
+) -> np.ndarray:
+    """Cubemap [6 n^2, C] along head-space directions [J, 3] in F frames -> [J, F, C] float32; light_index [F]: which of
+    several, one below the other."""
+    lights = 1 if light_index is None else int(light_index.max()) + 1
+    resolution = round((len(light) / 6 / lights) ** 0.5)
+    lookup = frame_lookup(directions, world_from_head, resolution, light_index)
+    values = lookup @ np.asarray(light, np.float64)
+    return values.astype(np.float32).reshape(len(directions), len(world_from_head), -1)

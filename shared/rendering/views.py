@@ -1,0 +1,246 @@
+"""A solved head from where no camera stood, and under light that no clip had; what it covers of itself.
+
+The transfer is traced once; a view needs a camera, a relit picture a light. Everything happens in head space: the light
+is turned into it, and the head stays where it is ("moves: camera" to the shading).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from shared.geometry.mesh import Mesh, interpolate, normalised
+from shared.geometry.raycast import camera_hits
+from shared.geometry.transforms import camera_centres, rigid, world_from_head
+from shared.imaging.frame_index import spread_frames
+from shared.imaging.image_sampling import SurfaceViewer
+from shared.imaging.texture import sample_bilinear
+from shared.rendering.envmap import cube_from_latlong, latlong_directions, latlong_lookup
+from shared.rendering.precomputed_transfer import Sizes, precompute_transfer
+from shared.rendering.render import SurfaceMaps, render_frame
+from shared.rendering.shading import DEEP, Material, VertexShading
+from shared.rendering.split_sum import SplitSum
+from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
+from shared.rendering.transfer import Transfer, mesh_points
+from shared.rendering.view_set import NOVEL_VIEWS, ROUGHNESSES, ViewSet
+
+DISTANCE_MM, FILLED = 900.0, 1.1
+"""The virtual camera's distance from the head's middle, and the head's half diagonal in half pictures."""
+LIGHT_RESOLUTION, VIEW_SIZES = 16, Sizes(directions=640, nodes=500)
+ORIENTATION_MM = 40.0
+EDGE_COSINE = -0.1
+"""Vertices that turn away from a camera by more than this show in no triangle that it sees."""
+RELIT_YAW_DEG = -15.0
+HELD_OUT_SHOWN = 4
+"""Held-out frames that the report re-renders beside the others."""
+
+
+@dataclass(frozen=True)
+class ViewCamera:
+    """camera_from_head [4, 4] mm, intrinsics [3, 3] px of a picture of size (width, height)."""
+
+    camera_from_head: np.ndarray
+    intrinsics: np.ndarray
+    size: tuple[int, int]
+
+
+def make_views(
+    mesh: Mesh,
+    maps: Mapping[str, np.ndarray],
+    envmap: np.ndarray,
+    camera_from_head: np.ndarray,
+    moves: str,
+    pixels: int,
+    held_out: Mapping[int, ViewCamera],
+    progress: Callable | None = None,
+) -> ViewSet:
+    """All of them, pixels wide. maps and progress as for HeadViews; envmap [H, 2 H, 3], camera_from_head [F, 4, 4] and
+    moves of the clip; held_out: frames of the clip to re-render, with their cameras."""
+    around = [orbit_camera(mesh, *place, pixels) for place in NOVEL_VIEWS.values()]
+    camera, front = orbit_camera(mesh, RELIT_YAW_DEG, 0.0, pixels), orbit_camera(mesh, 0.0, 0.0, pixels)
+    views = HeadViews(mesh, maps, VIEW_SIZES, [*around, camera, front, *held_out.values()], progress)
+    novel = views.render(clip_light(envmap, camera_from_head, moves), around)
+    again = views.render(envmap, list(held_out.values()), moves, fade=False) if held_out else []
+    return ViewSet(
+        dict(zip(NOVEL_VIEWS, novel, strict=True)),
+        {name: views.render(studio_light(name), [camera])[0] for name in STUDIO_LIGHTS},
+        {roughness: views.visibility(front, roughness) for roughness in ROUGHNESSES},
+        dict(zip(held_out, again, strict=True)),
+    )
+
+
+def orbit_camera(mesh: Mesh, yaw_deg: float, pitch_deg: float, pixels: int) -> ViewCamera:
+    """A camera that looks at the head's middle from yaw (90: its left, the picture's right seen from the front) and
+    pitch (90: above), a square picture of the given size."""
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    middle, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm((high - low)[:2]))
+    yaw, pitch = np.radians([yaw_deg, pitch_deg])
+    back = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
+    right = np.array([np.cos(yaw), 0.0, -np.sin(yaw)])
+    rotation = np.stack([right, np.cross(right, back), -back])  # x right, y down, z forward
+    focal = FILLED * pixels / 2 * DISTANCE_MM / radius
+    intrinsics = np.array([[focal, 0.0, pixels / 2], [0.0, focal, pixels / 2], [0.0, 0.0, 1.0]])
+    return ViewCamera(rigid(rotation, -rotation @ (middle + DISTANCE_MM * back)), intrinsics, (pixels, pixels))
+
+
+def held_out_cameras(
+    poses: Mapping[str, np.ndarray], intrinsics: np.ndarray, size: tuple[int, int], solve: Mapping
+) -> dict[int, ViewCamera]:
+    """{frame: Camera} of a few held-out frames that inverse_render did not re-render.
+
+    poses: its poses.npz; intrinsics [3, 3] and size of the crop, where that does not hold the former; solve: its
+    solve.json.
+    """
+    place = {int(frame): f for f, frame in enumerate(poses["frame_index"])}
+    done = set(solve["render_frames"])
+    rest = [frame for frame in solve.get("held_out_frames", ()) if frame in place and frame not in done]
+    chosen = [rest[i] for i in spread_frames(len(rest), HELD_OUT_SHOWN)] if rest else []
+    lens = poses.get("intrinsics_crop", intrinsics)
+    return {frame: ViewCamera(poses["camera_from_head"][place[frame]], lens, size) for frame in chosen}
+
+
+def frontal_frame(camera_from_head: np.ndarray) -> int:
+    """Index of the frame in which the face looks most directly into the camera. camera_from_head [F, 4, 4]."""
+    towards = -camera_from_head[:, :3, 3] / np.linalg.norm(camera_from_head[:, :3, 3], axis=1, keepdims=True)
+    return int(np.argmax((camera_from_head[:, :3, 2] * towards).sum(1)))
+
+
+def light_in_head_space(envmap: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Lat-long radiance in the world [H, 2 H, 3], turn [3, 3] world_from_head -> the same light as the head sees it."""
+    return latlong_lookup(envmap, latlong_directions(len(envmap)) @ turn.T)
+
+
+class HeadViews:
+    """Pictures of one solved head.
+
+    maps: diffuse_albedo [S, S, 3], specular_intensity [S, S], roughness [S, S]. cameras: all that will look at it, so
+    that only what they can see is traced; none: everything; only [V]: vertices that matter, all by default.
+    progress(items, label) wraps the trace. light_resolution: edge of the cubemap that lights are seen through; deep:
+    see VertexShading; over 1 where cavities are exact.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        maps: Mapping[str, np.ndarray],
+        sizes: Sizes | None = None,
+        cameras: Sequence[ViewCamera] = (),
+        progress: Callable | None = None,
+        light_resolution: int = LIGHT_RESOLUTION,
+        deep: float = DEEP,
+        only: np.ndarray | None = None,
+    ):
+        self.light_resolution, self.deep = light_resolution, deep
+        self.viewer = SurfaceViewer.of(mesh)
+        self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"])
+        self.precomputed = precompute_transfer(self.viewer, sizes or Sizes())
+        seen = np.ones(len(mesh.vertices), bool) if not cameras else self._seen(cameras)
+        self.index = np.nonzero(seen if only is None else seen & only)[0]
+        self.points = mesh_points(mesh, self.index)
+        wrap = progress or (lambda items, label: items)
+        self.transfer: Transfer = self.precomputed.trace(self.points, lambda items: wrap(items, "visibility"))
+        self.material = self._material(mesh, maps)
+        # What stands in for a point deep in a cavity is the nearest one in the open. Seen from inside the mouth that
+        # can be the outside of the cheek, unless orientation counts as well.
+        self._surface_place = np.concatenate([mesh.vertices, ORIENTATION_MM * self.viewer.normals], axis=1)
+        self._lit: VertexShading | None = None
+
+    def _seen(self, cameras: Sequence[ViewCamera]) -> np.ndarray:
+        """[V] bool: vertices that some camera sees, and those around them, whose triangles reach into the open."""
+        seen = np.zeros(len(self.viewer.mesh.vertices), bool)
+        for camera in cameras:
+            towards = self._towards(camera, self.viewer.mesh.vertices)
+            front = np.nonzero((towards * self.viewer.normals).sum(1) > EDGE_COSINE)[0]
+            starts = self.viewer.mesh.vertices[front] + self.viewer.offset * self.viewer.normals[front]
+            seen[front[~self.viewer.scene.occluded(starts, towards[front])]] = True
+        return self.viewer.grown(seen)
+
+    @staticmethod
+    def _towards(camera: ViewCamera, positions: np.ndarray) -> np.ndarray:
+        """[N, 3] unit vectors from the positions to the camera."""
+        return normalised(camera_centres(camera.camera_from_head[None])[0] - positions)
+
+    def _material(self, mesh: Mesh, maps: Mapping[str, np.ndarray]) -> Material:
+        """The maps at the nodes, for light that bounces, and the roughness at the traced points."""
+        uv = np.zeros((len(mesh.vertices), 2))
+        uv[mesh.faces.ravel()] = mesh.uvs[mesh.face_uvs.ravel()]
+        nearest = cKDTree(mesh.vertices).query(self.precomputed.nodes.points.positions)[1]
+        albedo = sample_bilinear(maps["diffuse_albedo"], uv[nearest])
+        gloss = float(np.median(sample_bilinear(maps["specular_intensity"], uv)))
+        roughness = sample_bilinear(maps["roughness"], uv).ravel()
+        varies = np.ptp(roughness) > 1e-3
+        return Material(albedo, gloss, float(np.median(roughness)), roughness[self.index] if varies else None)
+
+    def render(
+        self, light: np.ndarray, cameras: Sequence[ViewCamera], moves: str = "camera", fade: bool = True
+    ) -> list[np.ndarray]:
+        """Lat-long radiance [H, 2 H, 3] -> a linear picture [h, w, 3] per camera, 0 beside the head.
+
+        moves "camera": the light is given in head space; "head": in the world of geometry.world_from_head. fade: pixels
+        that the head covers in part are darker by the rest; else they show the mean of the part.
+        """
+        poses = np.stack([camera.camera_from_head for camera in cameras])
+        shading = self._shading(np.maximum(cube_from_latlong(light, self.light_resolution), 0.0), poses, moves)
+        pictures = []
+        for k, camera in enumerate(cameras):
+            picture, covered = render_frame(
+                self.viewer, shading, self.maps, k, camera.camera_from_head, camera.intrinsics, camera.size
+            )
+            pictures.append(picture * covered[..., None] if fade else picture)
+        return pictures
+
+    def _shading(self, light: np.ndarray, poses: np.ndarray, moves: str) -> VertexShading:
+        """Under a cubemap light; what no light changes is made once."""
+        if self._lit is None:
+            self._lit = VertexShading(
+                self.index,
+                self._surface_place,
+                self.points,
+                self.transfer,
+                self.precomputed.node_transfer,
+                self.material,
+                light,
+                self.precomputed.directions,
+                poses,
+                moves,
+                key_step=0.0,
+                deep=self.deep,
+            )
+            return self._lit
+        return self._lit.under(light, poses, moves)
+
+    def coverage(self, camera: ViewCamera, samples: int = 2) -> np.ndarray:
+        """[h, w] in 0 .. 1: how much of each pixel the head covers, as render counts it."""
+        covered = np.zeros(camera.size[::-1])
+        for row in range(samples):
+            for column in range(samples):
+                offsets = (column + 0.5) / samples, (row + 0.5) / samples
+                pose, lens = camera.camera_from_head, camera.intrinsics
+                covered += camera_hits(self.viewer.scene, pose, lens, *camera.size, offsets)[0] >= 0
+        return covered / samples**2
+
+    def visibility(self, camera: ViewCamera, roughness: float) -> np.ndarray:
+        """[h, w]: share of a lobe of this roughness about the reflected direction that the head leaves open; NaN beside
+        the head. 1 where nothing covers it; for rough lobes it nears the sky's open share."""
+        normals = self.points.normals
+        towards = self._towards(camera, self.points.positions)
+        facing = np.nonzero(((towards * normals).sum(1) > 0.0) & self._seen([camera])[self.index])[0]
+        share = np.ones(len(self.viewer.mesh.vertices))
+        visible = self.transfer.visibility(facing)
+        share[self.index[facing]] = SplitSum(self.precomputed.directions).visible_share(
+            normals[facing], towards[facing], roughness, visible
+        )
+        face, bary, _ = camera_hits(self.viewer.scene, camera.camera_from_head, camera.intrinsics, *camera.size)
+        hit = face >= 0
+        picture = np.full(face.shape, np.nan)
+        picture[hit] = interpolate(share, self.viewer.mesh.faces, face[hit], bary[hit])
+        return picture
+
+
+def clip_light(envmap: np.ndarray, camera_from_head: np.ndarray, moves: str) -> np.ndarray:
+    """The recovered light as the head saw it when it looked into the camera: lat-long in head space."""
+    turned = world_from_head(camera_from_head[None, frontal_frame(camera_from_head)], moves)[0]
+    return light_in_head_space(envmap, turned)

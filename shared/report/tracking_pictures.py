@@ -1,0 +1,84 @@
+"""The tracking stage's curves and its residual map."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from shared.geometry.mesh import Mesh, rasterize_uv
+from shared.geometry.transforms import WORLD_FROM_CAMERA, vector_from_rotation
+
+CURVE_COLOURS = ((70, 200, 255), (255, 150, 40), (120, 220, 120))
+PLOT_WIDTH, PLOT_HEIGHT, MARGIN = 900, 220, 56
+BRIGHTEST_PX = 0.5
+INK, PAPER, GRID = (225, 225, 225), (24, 24, 28), (60, 60, 66)
+
+
+def pose_curves(camera_from_head: np.ndarray, covariance: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+    """Rotation and position over time with bands of two standard deviations -> uint8 [h, w, 3].
+
+    camera_from_head [F, 4, 4]; covariance [F, 6, 6] of rotation vector and translation; time_s [F].
+    """
+    turns = WORLD_FROM_CAMERA @ camera_from_head[:, :3, :3]
+    middle = turns[len(turns) // 2]
+    angles = np.degrees(vector_from_rotation(turns @ middle.T))
+    shift = camera_from_head[:, :3, 3] - np.median(camera_from_head[:, :3, 3], axis=0)
+    deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    rotation = _plot(time_s, angles, np.degrees(deviation[:, :3]), ("pitch", "yaw", "roll"), "degrees")
+    doubt = _plot(time_s, np.degrees(deviation[:, :3]), None, ("pitch", "yaw", "roll"), "deviation, degrees")
+    position = _plot(time_s, shift, deviation[:, 3:], ("across", "down", "depth"), "mm")
+    return np.concatenate([rotation, doubt, position])
+
+
+def _plot(time_s, values, deviation, names, unit) -> np.ndarray:
+    """Three curves [F, 3] on one panel; deviation [F, 3] or None."""
+    canvas = np.full((PLOT_HEIGHT, PLOT_WIDTH, 3), PAPER, np.uint8)
+    low, high = float(values.min()), float(values.max())
+    low, high = (low - 0.05 * (high - low), high + 0.05 * (high - low)) if high > low else (low - 1.0, high + 1.0)
+    span_s = max(float(np.ptp(time_s)), 1e-6)
+
+    def at(t, value):
+        x = MARGIN + (t - time_s[0]) / span_s * (PLOT_WIDTH - MARGIN - 12)
+        y = PLOT_HEIGHT - 24 - (value - low) / (high - low) * (PLOT_HEIGHT - 44)
+        return np.stack([x, y], axis=-1)
+
+    for value in np.linspace(low, high, 5):
+        y = int(at(time_s[0], value)[1])
+        cv2.line(canvas, (MARGIN, y), (PLOT_WIDTH - 12, y), GRID, 1)
+        cv2.putText(canvas, f"{value:.3g}", (4, y + 4), cv2.FONT_HERSHEY_SIMPLEX, 0.4, INK, 1, cv2.LINE_AA)
+    for k, (name, colour) in enumerate(zip(names, CURVE_COLOURS, strict=True)):
+        if deviation is not None:
+            reach = 2 * deviation[:, k]
+            outline = np.concatenate([at(time_s, values[:, k] + reach), at(time_s, values[:, k] - reach)[::-1]])
+            band = canvas.copy()
+            cv2.fillPoly(band, [outline.astype(np.int32)], colour)
+            canvas = cv2.addWeighted(band, 0.35, canvas, 0.65, 0.0)
+        cv2.polylines(canvas, [at(time_s, values[:, k]).astype(np.int32)], False, colour, 1, cv2.LINE_AA)
+        cv2.putText(canvas, name, (MARGIN + 90 * k, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    label = f"{unit} over {span_s:.1f} s"
+    cv2.putText(canvas, label, (PLOT_WIDTH - 260, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
+    return canvas
+
+
+def residual_map(mesh: Mesh, points: np.ndarray, residual_px: np.ndarray, size: int = 512) -> np.ndarray:
+    """Each track point's error in the mesh's UV layout -> uint8 [size, size, 3], dark: none, bright: 0.5 px or more.
+
+    points [N, 3] in the mesh's space, residual_px [N].
+    """
+    face, bary = rasterize_uv(mesh, size)
+    canvas = np.full((size, size, 3), PAPER, np.uint8)
+    canvas[face >= 0] = GRID
+    rows, columns = np.nonzero(face >= 0)
+    places = np.einsum("nki,nk->ni", mesh.vertices[mesh.faces[face[rows, columns]]], bary[rows, columns])
+    brightness = np.clip(np.nan_to_num(residual_px) / BRIGHTEST_PX * 255, 0, 255).astype(np.uint8)
+    shade = cv2.applyColorMap(brightness[:, None], cv2.COLORMAP_INFERNO)[:, 0]
+    nearest = _nearest(places, points)
+    for index in np.nonzero(np.isfinite(residual_px))[0]:
+        centre = int(columns[nearest[index]]), int(rows[nearest[index]])
+        cv2.circle(canvas, centre, max(2, size // 170), shade[index][::-1].tolist(), -1, cv2.LINE_AA)
+    return canvas
+
+
+def _nearest(places: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return cKDTree(places).query(points)[1]

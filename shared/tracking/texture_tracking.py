@@ -1,0 +1,170 @@
+"""A pass of tracking: all frames against their own mean texture on the fitted head, then one rigid adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from shared.compute.robust import ROBUST_SCALE
+from shared.geometry.atlas import Atlas, PlacedFrame, build_atlas, place_frame, sample
+from shared.geometry.mesh import Mesh, vertex_normals
+from shared.geometry.raycast import RayScene
+from shared.tracking.bundle import Tracks, resect
+from shared.tracking.first_poses import (
+    LOSS,
+    Adjusted,
+    adjust_clip,
+    enough_observations,
+    spread_over_frames,
+    trackable_faces,
+)
+from shared.tracking.head_model import HeadModel
+from shared.tracking.texture_tracks import MeanContrast, Windows, mean_texture, track_frame
+from shared.tracking.tracked_clip import TrackedClip
+from shared.tracking.tracks import THREADS, visible_vertices
+
+LEAST_COSINE = 0.25
+"""Skin seen more obliquely is not tracked."""
+
+
+@dataclass(frozen=True)
+class TrackingPass:
+    """texel_px: texels per picture pixel; detail: track the finest texture, else the wide contrast; count of tracks."""
+
+    texel_px: float
+    detail: bool
+    count: int
+    windows: Windows
+    prior_mm: float
+
+
+COARSE_FACE_TEXELS = 280.0
+
+
+def coarse_pass(face_width_px: float) -> TrackingPass:
+    """The pass that takes in frames whose pose is only interpolated; a large face is seen in larger texels."""
+    texel_px = float(np.clip(round(face_width_px / COARSE_FACE_TEXELS), 1.0, 4.0))
+    return TrackingPass(texel_px, False, 1500, Windows(sigma=4.0, search=6.0, steps=4), 10.0)
+
+
+class AtlasTracker:
+    """The frames of a clip over one fitted head."""
+
+    def __init__(
+        self, clip: TrackedClip, model: HeadModel, vertices: np.ndarray, depth_mm: float, settings: TrackingPass
+    ):
+        """vertices [V, 3] mm of the fitted head; depth_mm: its distance from the camera."""
+        self._clip, self._vertices, self._settings = clip, vertices, settings
+        mesh = Mesh(vertices, model.faces, model.uvs, model.face_uvs)
+        texel_mm = settings.texel_px * depth_mm / clip.intrinsics[0, 0]
+        self.atlas: Atlas = build_atlas(mesh, trackable_faces(model), texel_mm, settings.count)
+        self._scene, self._normals = RayScene(vertices, model.faces), vertex_normals(vertices, model.faces)
+        self._pictures = clip.detail if settings.detail else clip.contrast
+        self._shrink = max(1, round(settings.texel_px))
+
+    def place(self, frame: int, camera_from_head: np.ndarray) -> PlacedFrame:
+        """Where a frame shows the atlas, for a believed pose."""
+        visible = visible_vertices(self._scene, self._vertices, self._normals, camera_from_head, LEAST_COSINE)
+        unusable = self._clip.unusable[frame]
+        return place_frame(self.atlas, self._vertices, camera_from_head, self._clip.intrinsics, visible, unusable)
+
+    def _picture(self, frame: int) -> np.ndarray:
+        """A frame's picture with pixels about as large as the texels: larger texels would only sample it."""
+        picture = self._pictures[frame]
+        if self._shrink == 1:
+            return picture
+        height, width = (-(-n // self._shrink) * self._shrink for n in picture.shape)
+        padded = cv2.copyMakeBorder(
+            picture, 0, height - picture.shape[0], 0, width - picture.shape[1], cv2.BORDER_REPLICATE
+        )
+        return cv2.resize(padded, None, fx=1 / self._shrink, fy=1 / self._shrink, interpolation=cv2.INTER_AREA)
+
+    def mean(self, frames: np.ndarray, poses: np.ndarray, progress: Callable) -> MeanContrast:
+        """Mean texture of chosen frames [K] with poses [F, 4, 4]."""
+        placed: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+        def picture(frame: int) -> tuple[np.ndarray, np.ndarray]:
+            if frame not in placed:
+                where = self.place(frame, poses[frame])
+                image = sample(self._picture(frame), where.layout / self._shrink, cv2.INTER_CUBIC)
+                placed[frame] = image, where.shown.astype(np.uint8)
+            image, shown = placed[frame]
+            return image.astype(np.float32), shown.astype(np.float32)
+
+        return mean_texture(lambda: _in_order(picture, progress(frames, "mean texture")))
+
+    def track(self, texture: MeanContrast, frames: np.ndarray, poses: np.ndarray, progress: Callable) -> Tracks:
+        """Tracks of all frames [F]; those that are not among the chosen [K] see nothing."""
+        count = len(self.atlas.rows)
+        pixels = np.full((len(poses), count, 2), np.nan)
+        whitening = np.zeros((len(poses), count, 2, 2))
+
+        def observe(frame: int):
+            where = self.place(frame, poses[frame])
+            shrunk = PlacedFrame(where.layout / self._shrink, where.shown)
+            found, whitening = track_frame(self.atlas, texture, self._picture(frame), shrunk, self._settings.windows)
+            return found * self._shrink, whitening / self._shrink
+
+        label = "fine tracks" if self._settings.detail else "tracks"
+        for frame, found in zip(frames, _in_order(observe, progress(frames, label)), strict=True):
+            pixels[frame], whitening[frame] = found
+        return Tracks(pixels, whitening)
+
+
+def _in_order(work: Callable, items) -> Iterator:
+    """work(item) for each, a few at once, in order; OpenCV and numpy let go of the interpreter."""
+    with ThreadPoolExecutor(THREADS) as pool:
+        waiting = []
+        for item in items:
+            waiting.append(pool.submit(work, int(item)))
+            if len(waiting) > 2 * THREADS:
+                yield waiting.pop(0).result()
+        for future in waiting:
+            yield future.result()
+
+
+def track_texture(
+    clip: TrackedClip,
+    model: HeadModel,
+    vertices: np.ndarray,
+    poses: np.ndarray,
+    known: np.ndarray,
+    tracked: np.ndarray,
+    settings: TrackingPass,
+    progress: Callable,
+) -> tuple[Tracks, np.ndarray, np.ndarray]:
+    """Tracks of the frames `tracked` against the mean of the frames `known` ([F] bool), then each frame's own pose.
+
+    poses [F, 4, 4] of the fitted head. -> tracks, their points [N, 3] on the head and the poses found.
+    """
+    tracker = AtlasTracker(clip, model, vertices, float(np.median(poses[known, 2, 3])), settings)
+    texture = tracker.mean(np.nonzero(known)[0], poses, progress)
+    tracks = tracker.track(texture, np.nonzero(tracked)[0], poses, progress)
+    points = tracker.atlas.points(vertices)
+    for loss in () if clip.hold_poses else (15.0, 5.0):
+        poses, _ = resect(tracks, poses, points, clip.intrinsics, loss_scale=loss * LOSS)
+    return tracks, points, poses
+
+
+def solve_texture(
+    clip: TrackedClip, tracks: Tracks, points: np.ndarray, poses: np.ndarray, prior_mm: float
+) -> Adjusted:
+    """Rigid adjustment; then the noise is set to what was left over: tracks and frames that fit badly weigh less."""
+    tracks, points, reliable = enough_observations(tracks, points)
+    for _ in range(2):
+        solved = adjust_clip(clip, tracks.subset(reliable), poses[reliable], points, prior_mm)
+        whitened = np.einsum("fnij,fnj->fni", tracks.whitening[reliable], solved.residuals_px)
+        of_track = ROBUST_SCALE * np.nanmedian(np.abs(whitened), axis=(0, 2))
+        of_frame = np.ones(len(reliable))
+        of_frame[reliable] = ROBUST_SCALE * np.nanmedian(np.abs(whitened), axis=(1, 2))
+        worse = np.maximum(of_frame / np.median(of_frame[reliable]), 1.0)
+        noise = np.maximum(of_track, 0.3) * worse[:, None]
+        tracks = Tracks(tracks.pixels, tracks.whitening / noise[..., None, None])
+        poses = np.array(poses)
+        poses[reliable], points = solved.camera_from_points, solved.points
+    error = np.nanmedian(solved.error_px, axis=0)
+    return spread_over_frames(solved, tracks, reliable, poses, error <= np.nanpercentile(error, 92))

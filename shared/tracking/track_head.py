@@ -1,0 +1,250 @@
+"""From landmarks to poses that hold still: landmark start, dense flow, tracks against the mean texture, head fit.
+
+The first poses come from a subset of the frames. The fitted head then carries the mean texture of the clip, all frames
+are tracked against it twice, first widely, then in the finest detail, and each time adjusted as one rigid body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from shared.errors import InputError
+from shared.geometry.mesh import normalised
+from shared.geometry.transforms import camera_centres, project, rigid, rotation_range_deg
+from shared.tracking.bundle import Tracks, place_points, zoomed
+from shared.tracking.depth_noise import DepthNoise, depth_noise
+from shared.tracking.first_poses import (
+    LOSS,
+    Adjusted,
+    FlowSettings,
+    flow_over_head,
+    flow_over_landmarks,
+    interpolate_poses,
+    known_landmarks,
+    landmark_poses,
+    start_from_landmarks,
+)
+from shared.tracking.fit_head import FitWeights, HeadFit, fit_codes, landmarks_on_points
+from shared.tracking.fit_surface import fit_surface
+from shared.tracking.head_model import HeadModel
+from shared.tracking.pose_uncertainty import estimate_uncertainty, focal_elsewhere
+from shared.tracking.texture_tracking import TrackingPass, coarse_pass, solve_texture, track_texture
+from shared.tracking.texture_tracks import Windows
+from shared.tracking.tracked_clip import TrackedClip
+
+LANDMARK_FRAMES = 15
+"""Landmarks are taken from so many frames around the middle of the motion."""
+
+FOLLOW_TEXELS = 3.0
+"""Half of what the coarse pass searches; landmarks jitter by less."""
+
+LEAST_ROTATION_DEG = 3.0
+"""Between the views that lie farthest apart: a still face has hundredths, the smallest turn that gives a result that is
+right 13."""
+
+HELD_OUT_EVERY = 8
+"""One fine track in so many is held out to judge the poses."""
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """start_frames: frames that the first poses come from; tracks: in a fine pass; texel_px: texels of its atlas."""
+
+    flow: FlowSettings = field(default_factory=FlowSettings)
+    start_frames: int = 60
+    fine_passes: int = 1
+    tracks: int = 2500
+    texel_px: float = 1.0
+    window_sigma: float = 5.0
+    prior_mm: float = 10.0
+    estimate_focal: bool = False
+    fit: FitWeights = field(default_factory=FitWeights)
+
+
+@dataclass(frozen=True)
+class HeadTrack:
+    """The result: poses [F, 4, 4] and covariance [F, 6, 6] of all F frames given, the fitted head, the track points.
+
+    sigma_mm [N]: how far each may be off in depth, see shared.tracking.depth_noise. error_px [F, N]: reprojection error
+    of each track point, NaN where not seen; reliable [F]: enough tracks.
+    noise_factor: see shared.tracking.pose_uncertainty. focal_gain, focal_deviation: the focal length over the given one
+    had it been solved, and the deviation of its logarithm; focal_solved: the result belongs to the solved one.
+    held_out_px: median error of tracks kept aside, under the poses before and after the last fine pass. held_off: see
+    shared.tracking.pose_uncertainty.
+    """
+
+    camera_from_head: np.ndarray
+    covariance: np.ndarray
+    fit: HeadFit
+    points_head: np.ndarray
+    sigma_mm: np.ndarray
+    error_px: np.ndarray
+    reliable: np.ndarray
+    noise_factor: float
+    focal_gain: float
+    focal_deviation: float
+    focal_solved: bool
+    held_out_px: tuple[float, float]
+    held_off: tuple[float, float] | None = None
+
+
+def track_head(
+    clip: TrackedClip, model: HeadModel, settings: TrackSettings, progress: Callable, note: Callable[[str], None]
+) -> HeadTrack:
+    """The whole solution. model: subdivided once; progress(iterable, label) wraps the long loops; note(text) logs."""
+    chosen = np.unique(np.linspace(0, clip.count - 1, min(settings.start_frames, clip.count)).round().astype(int))
+    few = clip.subset(chosen)
+    start, posed = start_from_landmarks(few, model, few.given_poses)
+    note(f"landmarks: {posed.sum()} of {len(posed)} frames with a pose, {np.nanmedian(start.error_px):.2f} px")
+    found = flow_over_landmarks(few, start, posed, settings.flow, progress)
+    note(_summary("flow over landmarks", found))
+    found = flow_over_head(few, model, _fit(few, model, found, settings)[0], found, settings.flow, progress)
+    note(_summary("flow over the head", found))
+    refuse_still_head(found.solution.camera_from_points[found.reliable])
+    elsewhere = focal_elsewhere(few, found)
+
+    fit, _ = _fit(few, model, found, settings)
+    poses, known = _onto_all(clip, model, chosen, fit, found)
+    found = _texture_pass(clip, model, fit, poses, known, coarse_pass(clip.face_width_px), progress)
+    note(_summary("tracks", found))
+    refuse_still_head(found.solution.camera_from_points[found.reliable])
+    fine = TrackingPass(
+        settings.texel_px, True, settings.tracks, Windows(sigma=settings.window_sigma), settings.prior_mm
+    )
+    for _ in range(settings.fine_passes):
+        fit, _ = _fit(clip, model, found, settings)
+        before = fit.camera_from_head(found.solution.camera_from_points)
+        finer, aside = _fine_pass(clip, model, fit, before, found.reliable, fine, progress)
+        note(_summary("fine tracks", finer))
+        held_out = tuple(_held_out_px(clip, aside, poses) for poses in (before, finer.solution.camera_from_points))
+        if held_out[1] > held_out[0]:
+            note(f"dropped: tracks kept aside went from {held_out[0]:.3f} to {held_out[1]:.3f} px")
+            break
+        found = finer
+    estimated = estimate_uncertainty(clip, found, settings.prior_mm, settings.estimate_focal, elsewhere)
+    found = estimated.adjusted
+    note(f"noise factor {estimated.noise_factor:.2f}, focal length {estimated.focal_gain:.4f} of the given one")
+    lens = zoomed(clip.intrinsics, estimated.focal_gain if estimated.focal_solved else 1.0)
+    fit, noise = _fit(replace(clip, intrinsics=lens), model, found, settings)
+    note(f"depth of a track point: {fit.scale * noise.single:.2f} mm, with what neighbours share "
+         f"{fit.scale * np.median(noise.sigma):.2f} mm")
+    unit = np.r_[1.0, 1.0, 1.0, np.full(3, fit.scale)]
+    return HeadTrack(
+        camera_from_head=fit.camera_from_head(found.solution.camera_from_points),
+        covariance=estimated.covariance * np.outer(unit, unit),
+        fit=fit,
+        points_head=fit.to_head(found.solution.points),
+        sigma_mm=fit.scale * noise.sigma,
+        error_px=found.solution.error_px,
+        reliable=found.reliable,
+        noise_factor=estimated.noise_factor,
+        focal_gain=estimated.focal_gain,
+        focal_deviation=estimated.focal_deviation,
+        focal_solved=estimated.focal_solved,
+        held_out_px=held_out,
+        held_off=estimated.held_off,
+    )
+
+
+def refuse_still_head(camera_from_head: np.ndarray) -> None:
+    """InputError for poses [F, 4, 4] that show the head from one side only: nothing then tells depth, lens or light."""
+    turned = rotation_range_deg(camera_from_head)
+    if not turned >= LEAST_ROTATION_DEG:
+        raise InputError(
+            "the head does not turn",
+            got=f"views that are {turned:.2f} degrees apart at most",
+            expected=f"{LEAST_ROTATION_DEG:g} degrees or more, better 50",
+            hint="film a head that turns 25 degrees to each side; where a poster, a screen or somebody else shows a "
+            "larger face than the person's, cover it or cut it off",
+        )
+
+
+def _onto_all(clip, model, chosen, fit, found) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of all frames from those of the chosen, and which of them are known [F] bool."""
+    poses = fit.camera_from_head(found.solution.camera_from_points)
+    if clip.hold_poses:
+        return carried_poses(clip.given_poses, clip.given_poses[chosen], poses), np.ones(clip.count, bool)
+    known = np.zeros(clip.count, bool)
+    known[chosen[found.reliable]] = True
+    return follow_landmarks(clip, known_landmarks(model, fit.vertices), poses[found.reliable], known), known
+
+
+def follow_landmarks(clip: TrackedClip, named: np.ndarray, poses: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Poses [F, 4, 4] of all frames from those [K, 4, 4] of the frames `known` [F] bool.
+
+    Between known frames motion is interpolated. Where a frame's landmarks say that the head was elsewhere by more than
+    FOLLOW_TEXELS of the coarse pass, its pose is theirs instead, with their bias as it is in the known frames around:
+    a head that starts or stops at once leaves the interpolation's path by more than tracks can be searched. Landmarks
+    full of outliers can give any pose: most of them must lie nearer to it than to the interpolated one.
+    named [468, 3]: landmarks on the head, NaN where the model has none.
+    """
+    between = interpolate_poses(poses, clip.time_s[known], clip.time_s)
+    usable = np.isfinite(named[:, 0])
+    limit_px = FOLLOW_TEXELS * coarse_pass(clip.face_width_px).texel_px
+    seen = landmark_poses(clip, named)
+    both = known & np.array([pose is not None for pose in seen])
+    if not both.any():
+        return between
+    bias = np.stack([np.linalg.inv(seen[i]) @ between[i] for i in np.nonzero(both)[0]])
+    bias = interpolate_poses(bias, clip.time_s[both], clip.time_s)
+    for i in np.nonzero(~known)[0]:
+        if seen[i] is not None:
+            expected = between[i] @ np.linalg.inv(bias[i])
+            pixels = project(named[usable], np.stack([expected, seen[i]]), clip.intrinsics)[0]
+            apart = np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1))
+            misses = np.median(np.linalg.norm(pixels - clip.landmarks_px[i, usable], axis=2), axis=1)
+            if apart > limit_px and misses[1] < misses[0]:
+                between[i] = seen[i] @ bias[i]
+    return between
+
+
+def carried_poses(poses: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Poses [F, 4, 4] in the head space and scale of target, which are the poses source [K, 4, 4] in another space."""
+    turn = source[0, :3, :3].T @ target[0, :3, :3]
+    rows = np.concatenate([source[:, :3, 3:], source[:, :3, :3]], axis=2).reshape(-1, 4)
+    scale, *shift = np.linalg.lstsq(rows, target[:, :3, 3].ravel(), rcond=None)[0]
+    return rigid(poses[:, :3, :3] @ turn, scale * poses[:, :3, 3] + poses[:, :3, :3] @ shift)
+
+
+def _texture_pass(clip, model, fit, poses, known, settings, progress) -> Adjusted:
+    tracked = np.ones(clip.count, bool)
+    tracks, points, poses = track_texture(clip, model, fit.vertices, poses, known, tracked, settings, progress)
+    return solve_texture(clip, tracks, points, poses, settings.prior_mm)
+
+
+def _fine_pass(clip, model, fit, poses, reliable, settings, progress) -> tuple[Adjusted, tuple[Tracks, np.ndarray]]:
+    """The adjusted fine tracks, and some that were kept aside, with their points."""
+    tracks, points, poses = track_texture(clip, model, fit.vertices, poses, reliable, reliable, settings, progress)
+    aside = np.arange(len(points)) % HELD_OUT_EVERY == HELD_OUT_EVERY // 2
+    found = solve_texture(clip, tracks.subset(points=~aside), points[~aside], poses, settings.prior_mm)
+    return found, (tracks.subset(points=aside), points[aside])
+
+
+def _held_out_px(clip: TrackedClip, aside: tuple[Tracks, np.ndarray], poses: np.ndarray) -> float:
+    """Median error of tracks that no adjustment has seen, their points placed by the poses [F, 4, 4]."""
+    tracks, points = aside
+    solved = place_points(tracks, poses, points, clip.intrinsics, loss_scale=LOSS, prior_mm=100.0)
+    return float(np.nanmedian(solved.error_px))
+
+
+def _summary(label: str, found: Adjusted) -> str:
+    error = np.nanmedian(found.solution.error_px)
+    return f"{label}: {len(found.solution.points)} tracks, {error:.3f} px median, {found.reliable.sum()} frames"
+
+
+def _fit(clip, model, found: Adjusted, settings) -> tuple[HeadFit, DepthNoise]:
+    """Codes, then the free correction, to track points and to the landmarks as they lie among them."""
+    solution, reliable = found.solution, found.reliable
+    poses = solution.camera_from_points[reliable]
+    directions = normalised(camera_centres(poses))
+    central = np.argsort(-(directions @ normalised(directions.mean(0))))[:LANDMARK_FRAMES]
+    landmarks = landmarks_on_points(
+        clip.landmarks_px[reliable][central], poses[central], solution.points, clip.intrinsics
+    )
+    noise = depth_noise(solution, reliable, clip.intrinsics)
+    weights = settings.fit.for_depth_noise(noise)
+    fit = fit_codes(model, solution.points, landmarks, weights)
+    return fit_surface(model, fit, solution.points, noise, weights), noise

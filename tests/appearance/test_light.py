@@ -1,0 +1,205 @@
+"""The light's operators and priors, the scale between light and albedo, the linear solver and the choice of frames."""
+
+import numpy as np
+import pytest
+
+from shared.appearance.albedo_scale import (
+    REFERENCE_SKINS,
+    Highlights,
+    fit_skin_locus,
+    most_likely_irradiance,
+    resolve_scale,
+)
+from shared.appearance.light import FrameLight, LightPriors, LogPrior, resample_light
+from shared.appearance.light_models import make_light_model, real_harmonics
+from shared.appearance.light_step import conjugate_gradients
+from shared.geometry.transforms import fibonacci_sphere, rotation_from_vector
+from shared.imaging.color import LUMINANCE
+from shared.imaging.frame_index import hold_out, spread_frames
+from shared.rendering.envmap import cube_directions
+
+DIRECTIONS = fibonacci_sphere(256)
+
+
+def smooth_light(directions):
+    """[N, 3] -> [N, 3] radiance of a broad lamp on a grey sky."""
+    lamp = np.exp(4.0 * (directions @ np.array([-0.6, 0.48, 0.64]) - 1.0))
+    return 0.45 + 0.15 * directions[:, 1:2] + lamp[:, None] * [2.2, 2.0, 1.8]
+
+
+def test_frame_light_and_its_adjoint():
+    turns = rotation_from_vector(np.array([[0.0, 0, 0], [0.2, -0.7, 0.1]]))
+    light = FrameLight(6, DIRECTIONS, turns)
+    rng = np.random.default_rng(3)
+    texels, values = rng.normal(size=(216, 3)), rng.normal(size=(len(DIRECTIONS), 2, 3))
+    assert np.allclose(light.along(np.ones((216, 1))), 1.0, atol=1e-6)
+    expected = (light.along(texels) * values).sum()
+    assert (texels * light.adjoint(values)).sum() == pytest.approx(expected, rel=1e-4, abs=1e-3)
+
+
+def test_light_prior_gradient_and_null_space():
+    prior, priors = LogPrior(4), LightPriors(smooth=2.0, white=3.0, edge=0.4)
+    rng = np.random.default_rng(4)
+    log_light, change = rng.normal(size=(2, 96, 3))
+    _, gradient, product = prior(log_light, priors)
+    ahead, behind = (prior(log_light + sign * 1e-5 * change, priors)[0] for sign in (1, -1))
+    assert (ahead - behind) / 2e-5 == pytest.approx((gradient * change).sum(), rel=1e-6)
+    assert (change * product(change)).sum() > 0
+    cost, gradient, _ = prior(np.full((96, 3), 1.7), priors)
+    assert cost == pytest.approx(0.0, abs=1e-12) and np.allclose(gradient, 0.0)
+
+
+def test_resampled_light_keeps_its_shape():
+    smooth = smooth_light(cube_directions(12))
+    assert np.abs(np.log(resample_light(smooth, 16) / smooth_light(cube_directions(16)))).max() < 0.1
+    assert np.allclose(resample_light(smooth, 12), smooth)
+
+
+def test_surfaces_receive_the_same_from_a_resampled_lamp():
+    """Lamps of one texel, a thousand times as bright as the others."""
+    light = np.full((6 * 8**2, 3), 0.1)
+    light[[27, 120, 300]] = 100.0
+    normals, directions = fibonacci_sphere(64), fibonacci_sphere(4096)
+    cosine = np.maximum(normals @ directions.T, 0.0)
+    before, after = (
+        cosine @ FrameLight(resolution, directions, np.eye(3)[None]).along(resample_light(light, resolution))[:, 0]
+        for resolution in (8, 16)
+    )
+    assert np.abs(after / before - 1.0).max() < 0.1
+
+
+# ---------------------------------------------------------------------- models
+
+
+def test_harmonics_are_orthonormal():
+    from shared.rendering.envmap import cube_solid_angles
+
+    basis = real_harmonics(cube_directions(24), 4)
+    gram = (basis * cube_solid_angles(24)[:, None]).T @ basis
+    assert np.abs(gram - np.eye(25)).max() < 0.01
+    assert np.allclose(basis[:, 0], np.sqrt(0.25 / np.pi))
+    # Degree 1 with y up: (y, z, x) up to the factor sqrt(3 / 4 pi) and signs.
+    assert np.allclose(np.abs(basis[:, [3, 1, 2]]), np.sqrt(0.75 / np.pi) * np.abs(cube_directions(24))[:, [2, 0, 1]])
+
+
+MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
+
+
+def some_light(name):
+    """A model with parameters in general position, and a random change of them."""
+    model = make_light_model(name, 6)
+    rng = np.random.default_rng(5)
+    params = model.fit(smooth_light(cube_directions(8)))
+    return model, params + 0.1 * rng.normal(size=params.shape), rng.normal(size=params.shape)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_light_models_have_the_derivatives_they_state(name):
+    model, params, change = some_light(name)
+    ahead, behind = (model.radiance(params + sign * 1e-5 * change) for sign in (1, -1))
+    tangent = model.tangent(params, change)
+    assert np.allclose((ahead - behind) / 2e-5, tangent, rtol=1e-4, atol=1e-6)
+    values = np.random.default_rng(6).normal(size=tangent.shape)
+    assert (values * tangent).sum() == pytest.approx((model.adjoint(params, values) * change).sum(), rel=1e-9)
+    priors = LightPriors(smooth=2.0, white=3.0)
+    _, gradient, product = model.prior(params, priors)
+    ahead, behind = (model.prior(params + sign * 1e-5 * change, priors)[0] for sign in (1, -1))
+    assert (ahead - behind) / 2e-5 == pytest.approx((gradient * change).sum(), rel=1e-5)
+    assert (change * product(change)).sum() > 0
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_light_models_scale_by_their_unit(name):
+    model, params, _ = some_light(name)
+    factor = np.array([0.2, -0.1, 0.4])
+    assert np.allclose(model.radiance(model.scaled(params, factor)), np.exp(factor) * model.radiance(params))
+    assert np.allclose(model.tangent(params, model.unit * np.ones(3)), model.radiance(params))
+
+
+def test_light_models_find_their_own_light():
+    """A low sun in a gradient sky is found as such; harmonics of order 4 come closer to it than of order 2."""
+    towards = np.array([0.6, 0.48, 0.64])
+    directions = cube_directions(16)
+    sky = np.exp(0.3 * directions[:, 1:2]) * [0.4, 0.5, 0.7]
+    light = sky + np.exp(80.0 * (directions @ towards - 1.0))[:, None] * [30.0, 25.0, 18.0]
+    sun = make_light_model("sun_sky", 16)
+    params = sun.fit(light)
+    found = params[-1] / np.linalg.norm(params[-1])
+    assert found @ towards > np.cos(np.radians(6.0))
+    assert np.allclose(np.exp(params[-2]), [30.0, 25.0, 18.0], rtol=0.15)
+    errors = [np.square(np.log(m.radiance(m.fit(light)) / light)).mean() for m in (
+        make_light_model("harmonics_2", 16), make_light_model("harmonics_4", 16), make_light_model("cubemap", 16))]
+    assert errors[0] > 1.2 * errors[1] > errors[2] and errors[2] < 1e-12
+    camera = make_light_model("camera", 16)
+    lit = camera.radiance(np.array([[-1.0] * 3, [2.0] * 3]))
+    assert directions[lit.sum(1).argmax()] @ [0, 0, 1] > np.cos(np.radians(6.0))
+    assert np.allclose(camera.fit(lit), [[-1.0] * 3, [2.0] * 3], atol=0.1)
+
+
+# ---------------------------------------------------------------------- scale
+
+
+def on_the_locus():
+    """log albedo [3] of the skin that the priors like best: mean luminance (linearised as there), chroma to match."""
+    locus = fit_skin_locus()
+    typical = np.median(REFERENCE_SKINS, axis=0)
+    share = LUMINANCE * typical / (LUMINANCE @ typical)
+    constant = np.log(LUMINANCE @ typical) - share @ np.log(typical)
+    matrix = np.array([share, [1.0, -1, 0], [0, -1.0, 1]])
+    return np.linalg.solve(matrix, [locus.mean_log_luminance - constant, *locus.offset])
+
+
+def test_white_light_on_likely_skin_is_taken_as_such():
+    for level in (-1.0, 0.0, 1.5):
+        found = most_likely_irradiance(on_the_locus() + level)
+        assert np.allclose(found, level, atol=1e-9)
+
+
+def test_the_scale_follows_the_exposure_and_shares_a_tint():
+    radiance = np.log([0.4, 0.3, 0.25])
+    assert np.allclose(most_likely_irradiance(radiance + 0.7), most_likely_irradiance(radiance) + 0.7)
+    tint = np.array([0.1, 0.0, -0.1])
+    moved = most_likely_irradiance(radiance + tint) - most_likely_irradiance(radiance)
+    assert 0.0 < moved[0] - moved[2] < 0.2
+    sure = most_likely_irradiance(radiance + tint, white_sigma=1e-4)
+    assert np.ptp(sure) < 1e-3
+
+
+def test_highlights_tell_a_bright_light_from_bright_skin():
+    """All statements agree on the factor 1/2: light twice too bright, so highlights look half as strong."""
+    skin, mean = on_the_locus(), (0.7, 0.35)
+    light = np.full(3, np.log(2.0))
+    found = Highlights(np.full(3, 0.35), np.full(3, 100.0), np.ones(3))
+    log_factor, specular = resolve_scale(skin - light, light, found, mean)
+    assert np.allclose(log_factor, -np.log(2.0), atol=1e-6)
+    assert specular == pytest.approx(0.7, rel=1e-6)
+    without, specular = resolve_scale(skin - light, light, None, mean)
+    assert np.allclose(without, -np.log(2.0), atol=1e-6) and specular == 0.7
+    stronger = Highlights(np.full(3, 0.7), np.full(3, 100.0), np.ones(3))
+    assert (resolve_scale(skin - light, light, stronger, mean)[0] > -np.log(2.0) + 0.05).all()
+
+
+def test_skin_locus_runs_through_the_reference_skins():
+    locus = fit_skin_locus()
+    luminance = np.log(REFERENCE_SKINS @ LUMINANCE) - locus.mean_log_luminance
+    chroma = np.log(REFERENCE_SKINS[:, [0, 2]] / REFERENCE_SKINS[:, [1]])
+    residual = chroma - locus.offset - luminance[:, None] * locus.slope
+    assert np.allclose(residual.sum(0), 0.0, atol=1e-9) and np.allclose(luminance @ residual, 0.0, atol=1e-9)
+    assert (np.abs(residual) < 3.0 * locus.sigma).all()
+
+
+def test_conjugate_gradients_solve():
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(12, 12))
+    matrix = root @ root.T + np.eye(12)
+    right = rng.normal(size=12)
+    found = conjugate_gradients(lambda x: matrix @ x, right, 60, tolerance=1e-10)
+    assert np.allclose(found, np.linalg.solve(matrix, right), atol=1e-6)
+
+
+def test_frames_are_spread_and_held_out_evenly():
+    assert spread_frames(100, 5).tolist() == [0, 25, 50, 74, 99]
+    assert spread_frames(3, 10).tolist() == [0, 1, 2]
+    fitted = hold_out(40, 8)
+    assert np.nonzero(~fitted)[0].tolist() == [4, 12, 20, 28, 36]
+    assert hold_out(8, 8).all()

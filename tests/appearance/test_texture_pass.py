@@ -1,0 +1,193 @@
+"""The texture pass on a plate with known maps under lights, highlights and shadows that wander."""
+
+import numpy as np
+import pytest
+from shapes import grid_plane
+
+from shared.appearance.maps import make_maps
+from shared.appearance.texture_pass import Clip, TexturePass
+from shared.geometry.mesh import interpolate
+from shared.geometry.raycast import RayScene, camera_hits
+from shared.geometry.transforms import rigid, rotation_from_vector
+from shared.imaging.image_sampling import SurfaceViewer, prepare_picture
+from shared.imaging.texels import TexelSurface
+from shared.imaging.texture import sample_bilinear
+
+SIZE, LENS = (96, 96), np.array([[400.0, 0, 48], [0, 400.0, 48], [0, 0, 1]])
+FRAMES, SPECULAR, MAP = 10, 0.6, 48
+
+
+class PlateShading:
+    """E and S of a plate's vertices in each frame: a light that wanders, and a highlight that wanders faster."""
+
+    def __init__(self, mesh):
+        self.uvs = mesh.uvs
+
+    def irradiance(self, frame):
+        angle = 0.6 * frame
+        tilt = self.uvs @ [np.cos(angle), np.sin(angle)]
+        return ((0.7 + 0.25 * tilt + 0.2 * np.sin(1.7 * frame))[:, None] * [1.0, 0.95, 0.9]).astype(np.float32)
+
+    def mean_irradiance(self, frames):
+        return np.mean([self.irradiance(frame) for frame in frames], axis=0)
+
+    def mean_slope(self, frames):
+        return np.zeros((len(self.uvs), 3))
+
+    def shadow_uncertainty(self, frame):
+        return np.zeros((len(self.uvs), 3), np.float32)
+
+    def reflection(self, frame):
+        centre = 0.5 + 0.4 * np.array([np.cos(1.1 * frame), np.sin(1.1 * frame)])
+        spot = 0.3 * np.exp(-((self.uvs - centre) ** 2).sum(1) / 0.08)
+        return np.repeat(spot[:, None], 3, axis=1).astype(np.float32)
+
+
+class ShadedPlate(PlateShading):
+    """The plate with a shadow that wanders over it, its border off by shift; uncertainty: whether that is known."""
+
+    def __init__(self, mesh, shift=0.0, uncertainty=False):
+        super().__init__(mesh)
+        self.shift, self.uncertainty = shift, uncertainty
+
+    def open_share(self, frame, shift):
+        border = 0.15 + 0.02 * frame + shift
+        return (0.05 + 0.95 * np.clip((self.uvs[:, :1] - border) / 0.06 + 0.5, 0.0, 1.0)).astype(np.float32)
+
+    def irradiance(self, frame):
+        return super().irradiance(frame) * self.open_share(frame, self.shift)
+
+    def shadow_uncertainty(self, frame):
+        spread = self.open_share(frame, self.shift + 0.05) - self.open_share(frame, self.shift - 0.05)
+        return self.uncertainty * np.abs(spread) * super().irradiance(frame)
+
+
+def true_albedo(uv):
+    x, y = np.moveaxis(uv, -1, 0)
+    return np.stack([0.5 + 0.2 * np.sin(6 * x), 0.35 + 0.15 * y, 0.25 + 0.1 * np.cos(5 * (x + y))], axis=-1)
+
+
+def plate_clip(mesh, shading, clip_at=np.inf):
+    """Pictures of the plate swinging +-12 degrees; its right fifth is behind the mask's border in all frames."""
+    scene = RayScene(mesh.vertices, mesh.faces)
+    swing = np.radians(12.0) * np.sin(np.arange(FRAMES))
+    rotation = np.diag([1.0, -1, -1]) @ rotation_from_vector(swing[:, None] * [0.4, 0.9, 0.0])
+    poses = rigid(rotation, np.tile([0.0, 0, 500.0], (FRAMES, 1)))
+    pictures = []
+    for f in range(FRAMES):
+        face, bary, _ = camera_hits(scene, poses[f], LENS, *SIZE)
+        hit = face >= 0
+        uv = interpolate(mesh.uvs, mesh.faces, face[hit], bary[hit])
+        lit = shading.irradiance(f), shading.reflection(f)
+        irradiance, reflection = (interpolate(values, mesh.faces, face[hit], bary[hit]) for values in lit)
+        linear = np.zeros(SIZE + (3,), np.float32)
+        linear[hit] = true_albedo(uv) * irradiance + SPECULAR * reflection
+        codes = np.where(linear >= clip_at, 255, 128).astype(np.uint8)
+        mask = np.zeros(SIZE, np.uint8)
+        mask[hit] = np.where(uv[:, 0] < 0.8, 255, 0)
+        pictures.append(prepare_picture(codes, np.minimum(linear, clip_at), mask))
+    fitted = np.arange(FRAMES) % 5 != 2
+    return Clip(pictures.__getitem__, poses, LENS, fitted)
+
+
+def run_pass(clip_at=np.inf, specular=SPECULAR, widths=(np.inf,)):
+    mesh = grid_plane(33, 80.0)
+    shading = PlateShading(mesh)
+    surface, viewer = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh)
+    clip = plate_clip(mesh, shading, clip_at)
+    texture = TexturePass(surface, viewer, shading, clip, specular, np.array([0.5, 0.4, 0.25]))
+    material, record = texture.run(widths)
+    return surface, material, record, make_maps(surface, material, 0.4)
+
+
+@pytest.fixture(scope="module")
+def plate():
+    return run_pass()
+
+
+def texel_uv(surface):
+    row, column = np.divmod(surface.pixel, surface.size)
+    return np.stack([(column + 0.5) / surface.size, 1.0 - (row + 0.5) / surface.size], axis=1)
+
+
+def test_albedo_is_found_where_the_clip_shows_it(plate):
+    surface, material, _, maps = plate
+    uv = texel_uv(surface)
+    seen = uv[:, 0] < 0.7
+    error = np.abs(material.albedo - true_albedo(uv))[seen]
+    assert np.median(error) < 0.004 and np.quantile(error, 0.99) < 0.03
+    assert np.allclose(sample_bilinear(maps["diffuse_albedo"], uv), material.albedo, atol=1e-6)
+    assert (maps["roughness"] == np.float32(0.4)).all()
+    assert np.allclose(maps["normal"], [0.5, 0.5, 1.0])
+
+
+def test_unseen_texels_are_filled_and_not_trusted(plate):
+    surface, material, _, maps = plate
+    unseen = texel_uv(surface)[:, 0] > 0.85
+    confidence = maps["confidence"].ravel()[surface.pixel]
+    assert (confidence >= 0).all() and (confidence <= 1).all()
+    assert confidence[unseen].max() < 1e-6
+    inner = (np.abs(texel_uv(surface) - [0.4, 0.5]) < [0.3, 0.4]).all(1)
+    assert confidence[inner].min() > 0.8
+    assert all(np.isfinite(image).all() for image in maps.values())
+    # The fill continues what the rim of the seen part shows.
+    assert np.abs(np.log(material.albedo[unseen] / np.array([0.4, 0.42, 0.28]))).max() < 0.7
+
+
+def test_more_frames_mean_more_confidence():
+    mesh = grid_plane(17, 80.0)
+    shading, surface = PlateShading(mesh), TexelSurface(mesh, 24)
+    viewer, found = SurfaceViewer.of(mesh), []
+    clip = plate_clip(mesh, shading)
+    for fitted in (np.arange(FRAMES) == 0, clip.fitted):
+        few = Clip(clip.picture, clip.camera_from_head, LENS, fitted)
+        material, _ = TexturePass(surface, viewer, shading, few, SPECULAR, np.full(3, 0.4)).run((np.inf,))
+        found.append(make_maps(surface, material, 0.4)["confidence"].ravel()[surface.pixel])
+    seen = texel_uv(surface)[:, 0] < 0.7
+    assert (found[1][seen] > found[0][seen]).all()
+
+
+def test_borders_of_shadows_that_lie_elsewhere_spoil_little():
+    """Samples near a border that may lie elsewhere count less, and texels that have no others are trusted less."""
+    mesh, found = grid_plane(33, 80.0), []
+    surface, viewer, clip = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh), plate_clip(mesh, ShadedPlate(mesh))
+    for uncertainty in (False, True):
+        shading = ShadedPlate(mesh, 0.04, uncertainty)
+        material, _ = TexturePass(surface, viewer, shading, clip, SPECULAR, np.array([0.5, 0.4, 0.25])).run((np.inf,))
+        confidence = make_maps(surface, material, 0.4)["confidence"].ravel()[surface.pixel]
+        found.append((np.abs(np.log(material.albedo / true_albedo(texel_uv(surface)))).max(1), confidence))
+    (plain, sure), (uncertain, less_sure) = found
+    u = texel_uv(surface)[:, 0]
+    crossed, never = (u > 0.12) & (u < 0.4), (u > 0.5) & (u < 0.7)
+    assert np.mean(uncertain[crossed] ** 2) < 0.6 * np.mean(plain[crossed] ** 2)
+    trusted = [np.sqrt(np.mean(error[crossed & (conf > 0.5)] ** 2)) for error, conf in found]
+    assert trusted[1] < 0.3 * trusted[0], "what is still trusted is right"
+    for with_uncertainty, without in ((uncertain, plain), (less_sure, sure)):
+        assert np.allclose(with_uncertainty[never], without[never], atol=0.01)
+
+
+def test_clipped_frames_do_not_darken_the_albedo():
+    """Bright frames are cut off at 0.5; taken at face value they would darken the texels by 4 % in the median."""
+    surface, material, _, _ = run_pass(clip_at=0.5)
+    uv = texel_uv(surface)
+    seen = (uv[:, 0] > 0.05) & (uv[:, 0] < 0.7)
+    ratio = material.albedo[seen, 0] / true_albedo(uv[seen])[:, 0]
+    assert abs(np.median(ratio) - 1.0) < 0.01
+    assert np.quantile(np.abs(ratio - 1.0), 0.9) < 0.05
+
+
+def test_held_out_frames_choose_the_pooling():
+    """With a wrong clip-wide intensity, pooled estimates explain the held-out frames better than one value."""
+    surface, material, record, _ = run_pass(specular=0.2, widths=(np.inf, 6.0))
+    assert record["chosen"] == "6 texels"
+    assert record["held_out"]["6 texels"] < record["held_out"]["one value"]
+    seen = texel_uv(surface)[:, 0] < 0.7
+    assert abs(np.median(material.specular[seen]) - SPECULAR) < abs(0.2 - SPECULAR)
+
+
+def test_an_intensity_for_each_texel_is_the_one_where_all_are_alike(plate):
+    surface, material, _, _ = plate
+    _, own, _, _ = run_pass(specular=np.full(len(surface), SPECULAR, np.float32))
+    assert np.allclose(own.albedo, material.albedo, atol=1e-5)
+    assert np.allclose(own.specular, material.specular)
+    assert np.allclose(own.information, material.information, rtol=1e-4)

@@ -1,0 +1,67 @@
+"""Items loaded, and written, on a second thread while the caller works."""
+
+import threading
+
+import pytest
+
+from shared.compute.read_ahead import read_ahead, write_behind
+
+
+def test_results_come_in_order_and_loading_runs_ahead():
+    begun, second = [], threading.Event()
+
+    def load(item):
+        begun.append(item)
+        if item == 1:
+            second.set()
+        return 10 * item
+
+    found = []
+    for result in read_ahead(map(load, range(4))):
+        if not found:
+            assert second.wait(timeout=300.0)  # the second is loaded while the first is held
+        found.append(result)
+    assert found == [0, 10, 20, 30] and begun == [0, 1, 2, 3]
+    assert list(read_ahead([])) == []
+
+
+def test_at_most_one_waits():
+    begun = []
+    results = read_ahead(begun.append(item) or item for item in range(100))
+    next(results)
+    results.close()
+    assert len(begun) <= 3
+
+
+def test_a_fault_is_raised_at_its_turn():
+    results = read_ahead(1 / item for item in (2, 0, 4))
+    assert next(results) == 0.5
+    with pytest.raises(ZeroDivisionError):
+        next(results)
+
+
+def test_calls_are_made_in_order_beside_the_caller():
+    made, go_on = [], threading.Event()
+
+    def call(item):
+        assert go_on.wait(timeout=300.0)
+        made.append(item)
+
+    with write_behind() as write:
+        write(call, 0)
+        assert made == []  # the caller is here while the call waits
+        go_on.set()
+        for item in range(1, 5):
+            write(call, item)
+            assert len(made) >= item  # one is on its way at most
+    assert made == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("after", [0, 1])
+def test_what_a_call_raises_reaches_the_caller(after):
+    made = []
+    with pytest.raises(ZeroDivisionError), write_behind() as write:
+        write(lambda: 1 / 0)
+        for _ in range(after):
+            write(made.append, 1)
+    assert made == []

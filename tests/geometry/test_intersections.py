@@ -1,0 +1,54 @@
+"""Surfaces that cut themselves are found, and moves that would make them do so are held back."""
+
+import numpy as np
+import pytest
+from shapes import grid_plane, sphere
+
+from shared.geometry.intersections import crossing_edges, move_without_crossing, turned_faces
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return sphere(50.0, 3)
+
+
+def test_a_ball_does_not_cut_itself(ball):
+    assert len(crossing_edges(ball.vertices, ball.faces)) == 0
+
+
+def test_a_vertex_pushed_through_the_far_side_is_found(ball):
+    pushed = ball.vertices.copy()
+    pushed[0] *= -1.2
+    around = ball.faces[(ball.faces == 0).any(1)]
+    found = crossing_edges(pushed, ball.faces)
+    assert len(found) > 0
+    assert (np.isin(found, around).all(1) | (found == 0).any(1)).any()
+
+
+def test_two_sheets_that_pass_through_each_other_are_found():
+    low, high = grid_plane(5, 10.0), grid_plane(5, 10.0)
+    turned = high.vertices[:, [0, 2, 1]] + [0.3, 0.2, 0.1]
+    vertices = np.concatenate([low.vertices, turned])
+    faces = np.concatenate([low.faces, high.faces + len(low.vertices)])
+    assert len(crossing_edges(vertices, faces)) > 0
+    apart = np.concatenate([low.vertices, turned + [0.0, 0.0, 20.0]])
+    assert len(crossing_edges(apart, faces)) == 0
+
+
+def test_folded_faces_are_unfolded():
+    plane = grid_plane(9, 8.0)
+    wanted = plane.vertices.copy()
+    wanted[40, 0] += 1.6
+    assert turned_faces(plane.vertices, wanted, plane.faces).any()
+    placed = move_without_crossing(plane.vertices, wanted, plane.faces)
+    assert not turned_faces(plane.vertices, placed, plane.faces).any()
+
+
+def test_a_move_stops_before_it_cuts_and_goes_on_elsewhere(ball):
+    wanted = 1.02 * ball.vertices
+    aside = int(np.argmin(np.abs(ball.vertices @ ball.vertices[0])))
+    wanted[0] = -1.2 * ball.vertices[0]
+    placed = move_without_crossing(ball.vertices, wanted, ball.faces)
+    assert len(crossing_edges(placed, ball.faces)) == 0
+    assert not turned_faces(ball.vertices, placed, ball.faces).any()
+    np.testing.assert_allclose(placed[aside], wanted[aside])

@@ -1,0 +1,67 @@
+"""Rays against known surfaces."""
+
+import numpy as np
+from shapes import grid_plane, sphere
+
+from shared.geometry.mesh import interpolate, normalised
+from shared.geometry.raycast import RayScene, camera_hits, on_faces, pixel_directions
+from shared.geometry.transforms import rigid
+
+
+def test_distance_and_place_of_a_hit():
+    plane = grid_plane(5, extent=2.0)
+    scene = RayScene(plane.vertices, plane.faces)
+    origins = np.array([[0.3, -0.2, 4.0], [5.0, 0, 4.0]])
+    face, bary, distance = scene.intersect(origins, np.array([[0, 0, -2.0], [0, 0, -2.0]]))
+    assert face[1] == -1 and np.isinf(distance[1])
+    assert np.isclose(distance[0], 2.0)
+    assert np.allclose(interpolate(plane.vertices, plane.faces, face[:1], bary[:1]), [[0.3, -0.2, 0]], atol=1e-6)
+    assert (scene.first_faces(origins, np.array([[0, 0, -2.0], [0, 0, -2.0]])) == face).all()
+
+
+def test_occlusion_has_no_range():
+    ball = sphere(1.0)
+    scene = RayScene(ball.vertices, ball.faces)
+    outward = np.array([[0, 0, 1.0]])
+    assert not scene.occluded(np.array([[0, 0, 1.01]]), outward)[0]
+    assert scene.occluded(np.array([[0, 0, -100.0]]), outward)[0]
+
+
+def test_no_rays_no_hits():
+    scene = RayScene(grid_plane().vertices, grid_plane().faces)
+    assert scene.occluded(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
+    assert scene.intersect(np.zeros((0, 3)), np.zeros((0, 3)))[1].shape == (0, 3)
+    assert scene.first_faces(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
+
+
+def test_camera_sees_the_disc_of_a_sphere():
+    ball = sphere(10.0, levels=5)
+    lens = np.array([[200.0, 0, 32], [0, 200.0, 32], [0, 0, 1]])
+    face, bary, depth = camera_hits(
+        RayScene(ball.vertices, ball.faces), rigid(np.eye(3), np.array([0, 0, 100.0])), lens, 64, 64
+    )
+    radius_px = 200.0 * 10.0 / np.sqrt(100.0**2 - 10.0**2)
+    assert abs((face >= 0).sum() - np.pi * radius_px**2) < 0.02 * np.pi * radius_px**2
+    assert abs(depth[32, 32] - 90.0) < 0.1
+    assert np.allclose(bary[face >= 0].sum(1), 1, atol=1e-5)
+
+
+def test_pixel_directions_pass_through_pixel_centres():
+    lens = np.array([[50.0, 0, 2], [0, 50.0, 1], [0, 0, 1]])
+    directions = pixel_directions(lens, 4, 2)
+    assert directions.shape == (2, 4, 3)
+    assert np.allclose(directions[0, 0], [(0.5 - 2) / 50, (0.5 - 1) / 50, 1])
+
+
+def test_places_on_faces_are_those_of_embree_in_doubles():
+    ball = sphere(50.0, 3)
+    rng = np.random.default_rng(4)
+    origins = np.array([0.0, 0.0, 200.0]) + rng.uniform(-25.0, 25.0, (200, 3))
+    directions = normalised(rng.uniform(-10.0, 10.0, (200, 3)) - origins)
+    face, rough, distance = RayScene(ball.vertices, ball.faces).intersect(origins, directions)
+    assert (face >= 0).all()
+    bary, exact = on_faces(ball.vertices, ball.faces, face, origins, directions)
+    np.testing.assert_allclose(bary, rough, atol=2e-4)
+    np.testing.assert_allclose(exact, distance, rtol=1e-5)
+    places = interpolate(ball.vertices, ball.faces, face, bary)
+    np.testing.assert_allclose(places, origins + exact[:, None] * directions, atol=1e-11)

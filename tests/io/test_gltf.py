@@ -1,0 +1,138 @@
+"""head.glb, read back by trimesh and by the container's own rules."""
+
+import io
+import json
+import struct
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from toy_result import FRAMES, INTRINSICS, SOURCE_SIZE, toy_maps, toy_mesh, toy_poses
+
+from shared.geometry.mesh import vertex_normals
+from shared.imaging.color import encode_srgb
+from shared.io.gltf import write_glb
+from shared.io.usd_capture import UsdCapture, world_from_head_rigid, world_from_usd_camera
+
+NAME = '1st "Zoë" <take> / été'
+
+
+def capture(moves):
+    return UsdCapture(toy_poses(), FRAMES, 25.0, INTRINSICS, *SOURCE_SIZE, moves)
+
+
+@pytest.fixture(params=["head", "camera"])
+def moves(request):
+    return request.param
+
+
+@pytest.fixture
+def file(tmp_path, moves):
+    write_glb(tmp_path / "head.glb", NAME, toy_mesh(), toy_maps(), capture(moves))
+    return tmp_path / "head.glb"
+
+
+def chunks(path):
+    """The JSON and the binary chunk, by the specification of the container."""
+    data = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON" and size % 4 == 0
+    content = json.loads(data[20 : 20 + size])
+    binary_size, binary_kind = struct.unpack_from("<I4s", data, 20 + size)
+    assert binary_kind == b"BIN\0" and 28 + size + binary_size == len(data)
+    return content, data[28 + size :]
+
+
+def accessor(content, binary, index):
+    """An accessor's values."""
+    row = content["accessors"][index]
+    view = content["bufferViews"][row["bufferView"]]
+    assert view["byteOffset"] % 4 == 0
+    kind = {5126: "<f4", 5125: "<u4"}[row["componentType"]]
+    columns = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[row["type"]]
+    values = np.frombuffer(binary, kind, row["count"] * columns, view["byteOffset"]).reshape(-1, columns)
+    assert values.nbytes == view["byteLength"]
+    for bound, reduce in (("min", np.min), ("max", np.max)):
+        if bound in row:
+            np.testing.assert_allclose(reduce(values, axis=0), row[bound], rtol=1e-6)
+    return values
+
+
+def picture(content, binary, texture):
+    view = content["bufferViews"][content["images"][content["textures"][texture]["source"]]["bufferView"]]
+    data = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    return decoded[..., [2, 1, 0, 3][: decoded.shape[2]]] / 255.0
+
+
+def test_geometry_in_metres_with_v_downwards(file):
+    mesh = toy_mesh()
+    primitive = next(iter(chunks(file)[0]["meshes"]))["primitives"][0]
+    content, binary = chunks(file)
+    index = accessor(content, binary, primitive["indices"]).reshape(-1, 3)
+    positions, normals, uvs = (accessor(content, binary, primitive["attributes"][name])[index] for name in (
+        "POSITION", "NORMAL", "TEXCOORD_0"))
+    np.testing.assert_allclose(positions, mesh.vertices[mesh.faces] * 0.001, atol=1e-7)
+    np.testing.assert_allclose(normals, vertex_normals(mesh.vertices, mesh.faces)[mesh.faces], atol=1e-6)
+    np.testing.assert_allclose(uvs * [1, -1] + [0, 1], mesh.uvs[mesh.face_uvs], atol=1e-6)
+
+
+def test_another_reader_agrees(file):
+    """trimesh: the same triangles, texture coordinates (turned back) and material."""
+    scene, mesh = trimesh.load(io.BytesIO(file.read_bytes()), file_type="glb"), toy_mesh()
+    (geometry,) = scene.geometry.values()
+    assert geometry.faces.shape == mesh.faces.shape
+    np.testing.assert_allclose(geometry.vertices[geometry.faces], mesh.vertices[mesh.faces] * 0.001, atol=1e-6)
+    np.testing.assert_allclose(geometry.visual.uv[geometry.faces], mesh.uvs[mesh.face_uvs], atol=1e-5)
+    material = geometry.visual.material
+    assert (material.name, material.metallicFactor, material.roughnessFactor) == ("skin", 0.0, 1.0)
+    assert set(scene.graph.nodes) >= {"head", "camera"}
+
+
+def test_textures_say_what_the_maps_say(file):
+    content, binary = chunks(file)
+    maps, material = toy_maps(), content["materials"][0]
+    surface, specular = material["pbrMetallicRoughness"], material["extensions"]["KHR_materials_specular"]
+    albedo = picture(content, binary, surface["baseColorTexture"]["index"])
+    np.testing.assert_allclose(albedo, encode_srgb(maps["diffuse_albedo"]), atol=0.5 / 255 + 1e-6)
+    rough = picture(content, binary, surface["metallicRoughnessTexture"]["index"])[..., 1]
+    np.testing.assert_allclose(rough * surface["roughnessFactor"], maps["roughness"], atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(picture(content, binary, material["normalTexture"]["index"]), maps["normal"],
+                               atol=0.5 / 255 + 1e-6)
+    weight = picture(content, binary, specular["specularTexture"]["index"])[..., 3]
+    # F0 = min(0.04 specularColor, 1) specular, where specular is the texture's alpha
+    f0 = 0.04 * specular["specularColorFactor"][0] * weight
+    np.testing.assert_allclose(f0, 0.04 * maps["specular_intensity"], atol=0.04 * 1.4 * 0.5 / 255 + 1e-6)
+    assert "KHR_materials_specular" in content["extensionsUsed"]
+
+
+def test_motion_and_lens(file, moves):
+    content, binary = chunks(file)
+    animation = content["animations"][0]
+    node = {"head": 0, "camera": 1}[moves]
+    expected = world_from_head_rigid(capture(moves)) if moves == "head" else world_from_usd_camera(capture(moves))
+    for channel in animation["channels"]:
+        sampler = animation["samplers"][channel["sampler"]]
+        assert channel["target"]["node"] == node
+        seconds = accessor(content, binary, sampler["input"])[:, 0]
+        np.testing.assert_allclose(seconds, (FRAMES - FRAMES[0]) / 25.0, atol=1e-6)
+        values = accessor(content, binary, sampler["output"])
+        if channel["target"]["path"] == "translation":
+            np.testing.assert_allclose(values, expected[:, :3, 3] * 0.001, atol=1e-6)
+        else:
+            x, y, z, w = values.T
+            third = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+            np.testing.assert_allclose(third, expected[:, :3, 2], atol=1e-6)
+            assert ((values[1:] * values[:-1]).sum(1) > 0).all()
+    lens = content["cameras"][0]["perspective"]
+    assert np.tan(lens["yfov"] / 2) == pytest.approx(SOURCE_SIZE[1] / 2 / INTRINSICS[1, 1])
+    assert np.tan(lens["yfov"] / 2) * lens["aspectRatio"] == pytest.approx(SOURCE_SIZE[0] / 2 / INTRINSICS[0, 0])
+
+
+def test_names_and_bytes(file, tmp_path, moves):
+    assert chunks(file)[0]["scenes"][0]["name"] == NAME
+    write_glb(tmp_path / "again.glb", NAME, toy_mesh(), toy_maps(), capture(moves))
+    assert (tmp_path / "again.glb").read_bytes() == file.read_bytes()

@@ -1,0 +1,121 @@
+"""Dense tracks on a textured plane that turns before the camera, where each point's place is known."""
+
+import cv2
+import numpy as np
+from shapes import grid_plane
+
+from shared.geometry.mesh import vertex_normals
+from shared.geometry.raycast import RayScene, camera_hits
+from shared.geometry.transforms import project, rigid, rotation_from_vector
+from shared.tracking.tracks import (
+    dense_tracks,
+    grid_from_landmarks,
+    grid_from_mesh,
+    local_contrast,
+    points_on_grid,
+    unusable_pixels,
+    visible_vertices,
+)
+
+LENS = np.array([[900.0, 0, 120], [0, 900.0, 120], [0, 0, 1]])
+SIZE = 240
+PLANE = grid_plane(9, extent=180.0)
+
+
+def texture(size=512):
+    rng = np.random.default_rng(0)
+    noise = sum(cv2.GaussianBlur(rng.normal(size=(size, size)), (0, 0), s) * s for s in (4, 8, 16))
+    return (128 + 40 * noise / noise.std()).clip(20, 240).astype(np.float32)
+
+
+def contrast(image, sigma_px=4.0):
+    return local_contrast(image, sigma_px, 1.5 * sigma_px, 0.02)
+
+
+def render(pose, image, gain=1.0):
+    """What the camera sees of the textured plane, as uint8."""
+    scene = RayScene(PLANE.vertices, PLANE.faces)
+    face, bary, _ = camera_hits(scene, pose, LENS, SIZE, SIZE)
+    uv = (PLANE.uvs[PLANE.faces[np.maximum(face, 0)]] * bary[..., None]).sum(2)
+    at = (uv * [image.shape[1], -image.shape[0]] + [0, image.shape[0]] - 0.5).astype(np.float32)
+    seen = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+    return np.where(face >= 0, gain * seen, 5).clip(0, 255).astype(np.uint8)
+
+
+def poses():
+    turns = np.array([[0, 0, 0], [0, 0.2, 0], [0.15, -0.2, 0.05]])
+    return rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(turns), np.array([0.0, 0, 900.0]))
+
+
+def test_tracks_find_the_skin_where_it_is_despite_a_change_of_light():
+    true, gains = poses(), (1.0, 0.7, 1.0)
+    images = [render(pose, texture(), gain) for pose, gain in zip(true, gains, strict=True)]
+    believed = true.copy()
+    believed[1:, 0, 3] += 2.0  # the warp is wrong by 2 mm, two pixels
+    scene = RayScene(PLANE.vertices, PLANE.faces)
+    everything = np.ones(len(PLANE.faces), bool)
+    grid = grid_from_mesh(scene, PLANE.faces, everything, true[0], LENS, np.array([25, 25, 215, 215.0]), 0, 2.0)
+    positions, _ = project(PLANE.vertices, believed, LENS)
+    tracks, where = dense_tracks(
+        grid,
+        [contrast(image) for image in images],
+        [np.zeros((SIZE, SIZE), np.uint8)] * 3,
+        positions,
+        np.ones((3, len(PLANE.vertices)), bool),
+        count=300,
+        search_px=6.0,
+    )
+    expected = project(points_on_grid(grid, where, PLANE.vertices), true, LENS)[0]
+    error = np.linalg.norm(tracks - expected, axis=-1)
+    assert np.isfinite(error).mean() > 0.7
+    assert np.nanmedian(error[0]) < 0.02
+    assert np.nanmedian(error[1:]) < 0.12
+
+
+def test_hidden_vertices_give_no_tracks():
+    true = poses()
+    image = contrast(render(true[0], texture()))
+    grid = grid_from_landmarks(project(PLANE.vertices, true[0], LENS)[0], 0, 1.0)
+    visible = np.ones((2, len(PLANE.vertices)), bool)
+    visible[1] = False
+    positions = project(PLANE.vertices, true[[0, 0]], LENS)[0]
+    no_mask = [np.zeros((SIZE, SIZE), np.uint8)] * 2
+    tracks, _ = dense_tracks(grid, [image] * 2, no_mask, positions, visible, count=100, search_px=5.0)
+    assert np.isfinite(tracks[0]).any()
+    assert np.isnan(tracks[1]).all()
+
+
+def test_visibility_needs_a_clear_and_frontal_view():
+    near = PLANE.vertices * 0.3 + [0, 0, 100.0]
+    vertices = np.concatenate([PLANE.vertices, near])
+    faces = np.concatenate([PLANE.faces, PLANE.faces + len(PLANE.vertices)])
+    scene, normals = RayScene(vertices, faces), vertex_normals(vertices, faces)
+    seen = visible_vertices(scene, vertices, normals, poses()[0], 0.2)
+    assert not seen[len(PLANE.vertices) // 2]
+    assert seen[len(PLANE.vertices) :].all() and seen[0]
+    behind = rigid(np.diag([-1.0, -1, 1]), np.array([0, 0, 900.0]))
+    assert not visible_vertices(scene, vertices, normals, behind, 0.2).any()
+
+
+def test_clipped_and_crushed_pixels_are_unusable():
+    image = np.full((20, 20, 3), 120, np.uint8)
+    image[5, 5] = 255
+    image[14, 14] = 3
+    bad = unusable_pixels(image)
+    assert bad[3:8, 3:8].all() and bad[12:17, 12:17].all()
+    assert bad.sum() == 50
+
+
+def test_local_contrast_ignores_gain():
+    image = np.clip(texture(128), 60, 200)
+    bright, dark = contrast(image.astype(np.uint8), 5.0), contrast((image * 0.5).astype(np.uint8), 5.0)
+    assert np.corrcoef(bright.ravel().astype(float), dark.ravel().astype(float))[0, 1] > 0.97
+
+
+def test_local_contrast_s_floor_leaves_noise_dark():
+    rng = np.random.default_rng(1)
+    noise = (100 + rng.normal(size=(80, 80))).round().astype(np.uint8)
+    loud, quiet = (local_contrast(noise, 4.0, 6.0, floor).astype(float).std() for floor in (0.001, 0.1))
+    assert quiet < 0.2 * loud
+    flat = local_contrast(np.full((40, 40), 90, np.uint8), 4.0, 6.0, 0.02)
+    assert np.abs(flat.astype(int) - 128).max() <= 1

@@ -1,0 +1,160 @@
+"""What stands before the camera in a stress test: a synthetic head under some light, as linear pictures with truth.
+
+A scene is rendered once and kept; what a camera makes of it is another matter (camera), and scenes under
+different lights may be added up, because light is additive.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from shared.io.arrays import save_arrays
+from shared.rendering.envmap import latlong_directions
+from tools.synthesis import output
+from tools.synthesis.camera import PictureQuality, PinholeCamera
+from tools.synthesis.head import Head, random_head
+from tools.synthesis.irradiance import IrradianceQuality
+from tools.synthesis.makeup import made_up, sweaty
+from tools.synthesis.render import RenderQuality, Scene, render
+from tools.synthesis.skin import Complexion, SkinPainter
+from tools.synthesis.subject import SENSOR_MM, SynthesisSettings, head_model, light_of, plan_shots
+from tools.synthesis.surface import Materials
+from tools.synthesis.wear import coloured, with_beard, with_fringe, with_glasses
+
+SETTINGS = SynthesisSettings(size=224, frames=24, level=1, texture=512, truth_frames=6, lights=("room",),
+                             light_height=32,
+                             irradiance=IrradianceQuality(size=128, directions=512, lamp_samples=16),
+                             picture=PictureQuality(sub=2, lobe_samples=1, lamp_samples=2))
+"""Small, so that a run takes less than a minute on one core; the face is 115 px high."""
+RECIPE = 1
+"""Raise it whenever SETTINGS or the code that renders give other pictures: kept scenes and rows are then not used."""
+TINTS = np.array([[1.0, 0.12, 0.1], [0.1, 0.25, 1.0]])
+"""Colours of the light from the left and from the right."""
+SMILE = {"mouth_smile_left": 1.0, "mouth_smile_right": 1.0, "jaw_open": 0.35, "cheek_puff": 0.2}
+SMILE_TIMES = ((0.40, 0.5), (0.44, 1.0), (0.66, 0.5), (0.70, 0.0))
+"""From which share of the clip on how much of the smile there is."""
+
+
+@dataclass(frozen=True)
+class StressScene:
+    """light: one of ENVIRONMENTS; on_head: it turns with the head; tint: how coloured the two sides are, 0 to 1.
+
+    tone: melanin; makeup, wet, fringe: shares; glasses_mm, beard_mm: thickness; smile: what comes and goes mid-clip.
+    """
+
+    light: str = "room"
+    on_head: bool = False
+    tint: float = 0.0
+    tone: float = 0.35
+    makeup: float = 0.0
+    wet: float = 0.0
+    glasses_mm: float = 0.0
+    fringe: float = 0.0
+    beard_mm: float = 0.0
+    smile: float = 0.0
+    yaw_deg: float = SETTINGS.yaw_deg
+    pitch_deg: float = SETTINGS.pitch_deg
+    frames: int = SETTINGS.frames
+    seed: int = 0
+
+    @property
+    def name(self) -> str:
+        """What differs from the defaults, and a digest of everything that decides the pictures."""
+        changed = [f"{f.name}{getattr(self, f.name):g}" if not isinstance(getattr(self, f.name), str)
+                   else getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default]
+        content = json.dumps([asdict(self), RECIPE], sort_keys=True)
+        return "_".join([*changed, hashlib.sha256(content.encode()).hexdigest()[:8]])
+
+    @property
+    def settings(self) -> SynthesisSettings:
+        """Of the synthesiser; sharp highlights need more samples."""
+        quality = SETTINGS.picture if not self.wet else replace(SETTINGS.picture, lobe_samples=4, lamp_samples=8)
+        return replace(SETTINGS, frames=self.frames, yaw_deg=self.yaw_deg, pitch_deg=self.pitch_deg, tone=self.tone,
+                       lights=(self.light,), seed=self.seed, picture=quality)
+
+
+def camera() -> PinholeCamera:
+    """The one that looks at every scene."""
+    return PinholeCamera(SETTINGS.size, SETTINGS.size, SETTINGS.focal_mm / SENSOR_MM * SETTINGS.size)
+
+
+def render_scene(scene: StressScene, folder: Path, processes: int = 1) -> Path:
+    """folder/<scene's name> with radiance.npy [F, H, W, 3] half floats and gt/; rendered unless it is there."""
+    done = folder / scene.name
+    if (done / "radiance.npy").exists():
+        return done
+    settings, truth, states, light = scene.settings, _truth_frames(scene), list(_states(scene)), _light(scene)
+    shots = plan_shots(states[0][0], settings)
+    if scene.on_head:
+        shots = [replace(shot, world_from_head=np.eye(3)) for shot in shots]
+    (done / "gt").mkdir(parents=True, exist_ok=True)
+    pictures: list[np.ndarray | None] = [None] * scene.frames
+    for number, (head, materials, index) in enumerate(states):
+        scene = Scene(head.mesh, materials, (light,))
+        if number == 0:
+            output.write_scene_truth(done / "gt", scene, head.mesh, 10)
+        quality = RenderQuality(settings.irradiance, settings.picture, settings.seed)
+        chosen = [shots[i] for i in index]
+        wanted = [i in truth for i in index]
+        for i, images in zip(index, render(scene, chosen, camera(), quality, wanted, processes), strict=True):
+            pictures[i] = images["radiance"]
+            if i in truth:
+                output.write_buffers(str(done / "gt" / "frames" / f"{i:04d}"), images, images, 10)
+    poses = np.stack([shot.camera_from_head for shot in shots])
+    output.write_poses(done / "gt" / "poses.npz", poses, camera(), truth)
+    save_arrays(done / "landmarks.npz", points_head=states[0][0].landmarks())
+    temporary = done / "radiance.tmp.npy"
+    np.save(temporary, np.stack(pictures).astype(np.float16))
+    temporary.rename(done / "radiance.npy")
+    return done
+
+
+def smile_of(frames: int) -> np.ndarray:
+    """[F] how much of the smile each frame shows."""
+    time, amount = np.arange(frames) / frames, np.zeros(frames)
+    for start, value in SMILE_TIMES:
+        amount[time >= start] = value
+    return amount
+
+
+def _truth_frames(scene: StressScene) -> np.ndarray:
+    """Frames that get buffers, evenly spread over those with the face that the mesh has."""
+    still = np.arange(scene.frames) if not scene.smile else np.nonzero(smile_of(scene.frames) == 0)[0]
+    return still[np.unique(np.linspace(0, len(still) - 1, SETTINGS.truth_frames).round().astype(int))]
+
+
+def _states(scene: StressScene) -> Iterator[tuple[Head, Materials, list[int]]]:
+    """Heads with their textures and frames: the neutral one first."""
+    model = head_model(SETTINGS.level)
+    amount = scene.smile * smile_of(scene.frames)
+    neutral = random_head(model, scene.seed, False)
+    # Painted once: what the skin shows moves along with it.
+    painter = SkinPainter(neutral, SETTINGS.texture, scene.seed)
+    stubble = 1.3 if scene.beard_mm else Complexion.stubble
+    materials = sweaty(made_up(painter.paint(Complexion(tone=scene.tone, stubble=stubble)), painter, scene.makeup),
+                       scene.wet)
+    if scene.glasses_mm or scene.fringe:
+        materials = coloured(materials)
+    for value in sorted(set(amount)):
+        head = random_head(model, scene.seed, False, {name: value * part for name, part in SMILE.items()})
+        if scene.beard_mm:
+            head = with_beard(head, scene.beard_mm, scene.seed)
+        if scene.glasses_mm:
+            head = with_glasses(head, scene.glasses_mm)
+        if scene.fringe:
+            head = with_fringe(head, scene.fringe, scene.seed)
+        yield head, materials, np.nonzero(amount == value)[0].tolist()
+
+
+def _light(scene: StressScene) -> np.ndarray:
+    """[H, 2 H, 3] the scene's environment."""
+    image = light_of(scene.light, scene.settings)
+    side = np.clip(0.5 + 1.5 * latlong_directions(len(image))[..., :1], 0.0, 1.0)
+    tint = (1 - side) * TINTS[0] + side * TINTS[1]
+    return (image * (1.0 + scene.tint * (tint - 1.0))).astype(np.float32)

@@ -1,0 +1,50 @@
+"""Scores as a few aligned lines for people."""
+
+from __future__ import annotations
+
+GAINS = "{psnr:.1f} dB, with gains {psnr_gain:.1f} dB"
+SCALAR = (
+    "RMSE {rmse:.3f}, scaled {rmse_scaled:.3f}, correlation {correlation:.2f}, mean {mean_result:.3f} "
+    "(truth {mean_gt:.3f})"
+)
+LIGHT = (
+    "relative RMSE matte {irradiance_rel_rmse:.1%}, front {irradiance_front_rel_rmse:.1%}; 25 deg lobe "
+    "{lobe25_rel_rmse:.1%}, front {lobe25_front_rel_rmse:.1%}"
+)
+ALBEDO = "dE2000 median {delta_e2000_median:.2f}, {psnr_srgb:.1f} dB sRGB, {psnr_linear:.1f} dB linear"
+ALBEDO_NAMES = {"aligned": "aligned  ", "aligned_one_gain": "one gain ", "raw": "raw      "}
+
+
+def table(scores: dict) -> str:
+    """What tools.scoring.score.score returns -> text, one measure a line."""
+    lines = _shape_lines(scores) + _appearance_lines(scores)
+    width = max(len(name) for name, _ in lines)
+    return "\n".join(f"{name:{width}s}  {text}" for name, text in lines)
+
+
+def _shape_lines(scores: dict) -> list[tuple[str, str]]:
+    geometry, pose, own = scores["geometry_mm"], scores["pose"], scores["pose_own_alignment"]
+    within, scale = geometry["within_5mm"], scores["alignment"]["scale"]
+    frames, depth = pose["frames"], pose["depth_mm_median"]
+    return [
+        ("geometry", f"{_spread(geometry)} mm, within 5 mm {within:.1%}, scale {scale:.4f}"),
+        ("rotation", f"{_spread(pose['rotation_deg'])} deg, without the mesh {_spread(own['rotation_deg'])}"),
+        ("translation", f"{_spread(pose['translation_mm'])} mm, depth {depth:.3g} median, {frames} frames"),
+        ("normals", f"{_spread(scores['normal_deg'])} deg, coverage {scores['mask_coverage']:.1%}"),
+    ]
+
+
+def _appearance_lines(scores: dict) -> list[tuple[str, str]]:
+    lines = []
+    if "albedo" in scores:
+        lines += [("albedo", title + ALBEDO.format(**scores["albedo"][name])) for name, title in ALBEDO_NAMES.items()]
+    lines += [(name, SCALAR.format(**scores[name])) for name in ("specular", "roughness") if name in scores]
+    if "envmap" in scores:
+        lines.append(("light", LIGHT.format(**scores["envmap"])))
+    if "rerender" in scores:
+        lines.append(("re-render", GAINS.format(**scores["rerender"])))
+    return lines + [(f"relight {light}", GAINS.format(**value)) for light, value in scores.get("relight", {}).items()]
+
+
+def _spread(values: dict[str, float]) -> str:
+    return "median {median:.3g}, mean {mean:.3g}, p95 {p95:.3g}".format(**values)

@@ -1,0 +1,131 @@
+"""Pictures of the lit surface: radiance, and the buffers of the truth.
+
+Each pixel averages a regular grid of sub x sub primary rays. Diffuse light comes from the irradiance atlas, the glossy
+part from samples of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.geometry.mesh import normalised
+from shared.geometry.transforms import project
+from shared.imaging.texture import sample_bilinear
+from shared.rendering.envmap import latlong_lookup
+from tools.synthesis.highlights import SAMPLE_SETS, GlossSamples, glossy_radiance
+from tools.synthesis.irradiance import SyntheticShot
+from tools.synthesis.light import EnvironmentLight
+from tools.synthesis.surface import SyntheticSurface
+
+TEXTURES = ("albedo", "specular", "roughness")
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """Pinhole with its principal point in the middle: width and height in pixels, focal length in pixels."""
+
+    width: int
+    height: int
+    focal_px: float
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """[3, 3], pixel centres at integer + 0.5."""
+        return np.array([[self.focal_px, 0, self.width / 2], [0, self.focal_px, self.height / 2], [0, 0, 1.0]])
+
+
+@dataclass(frozen=True)
+class PictureQuality:
+    """Primary rays per pixel (sub^2), and lobe and lamp samples per primary ray."""
+
+    sub: int = 2
+    lobe_samples: int = 2
+    lamp_samples: int = 4
+
+
+def take_picture(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray, shot: SyntheticShot,
+                 camera: PinholeCamera,
+                 quality: PictureQuality) -> dict[str, np.ndarray]:
+    """irradiance [size, size, 3] of this shot -> float32 images by name.
+
+    radiance [H, W, 3]; albedo [H, W, 3], normal [H, W, 3] (head space), specular and roughness [H, W]: means over the
+    rays that hit the head, 0 where none does; depth (camera z, mm), mask (face skin) and head [H, W]: means over all
+    rays.
+    """
+    rays = quality.sub**2
+    rng = np.random.default_rng(shot.seed)
+    samples = GlossSamples.draw(light, shot.world_from_head, rays * quality.lobe_samples,
+                                rays * quality.lamp_samples, rng)
+    pixels = _head_pixels(surface, shot, camera)
+    choice = rng.integers(SAMPLE_SETS, size=len(pixels))
+    background = _background(light, shot, camera)
+    total = {"radiance": background * rays}
+    for order, offset in enumerate(np.ndindex(quality.sub, quality.sub)):
+        shift = (np.array(offset[::-1]) + 0.5) / quality.sub
+        hit, directions, values = _primary_hits(surface, shot, camera, pixels + shift)
+        values["radiance"] = _shade(surface, light, irradiance, shot, directions, values, samples.part(order, rays),
+                                    choice[hit])
+        column, row = pixels[hit].T
+        total["radiance"][row, column] -= background[row, column]
+        for name in ("radiance", "normal", "depth", "mask", "head", *TEXTURES):
+            empty = np.zeros((camera.height, camera.width, *values[name].shape[1:]), np.float32)
+            total.setdefault(name, empty)[row, column] += values[name]
+    return _averaged(total, rays)
+
+
+def _averaged(total: dict[str, np.ndarray], rays: int) -> dict[str, np.ndarray]:
+    seen = np.maximum(total["head"], 1.0)
+    for name in TEXTURES:
+        total[name] /= seen.reshape(seen.shape + (1,) * (total[name].ndim - 2))
+    total["normal"] = normalised(total["normal"])
+    for name in ("radiance", "depth", "mask", "head"):
+        total[name] /= rays
+    return {name: image.astype(np.float32) for name, image in total.items()}
+
+
+def _head_pixels(surface: SyntheticSurface, shot: SyntheticShot, camera: PinholeCamera) -> np.ndarray:
+    """[N, 2] column and row of the pixels in the bounding box of the projected mesh."""
+    px, _ = project(surface.mesh.vertices, shot.camera_from_head, camera.intrinsics)
+    size = [camera.width, camera.height]
+    low, high = np.clip([np.floor(px.min(0)), np.ceil(px.max(0))], 0, size).astype(int)
+    return np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1).reshape(-1, 2)
+
+
+def _camera_directions(points_px: np.ndarray, camera: PinholeCamera) -> np.ndarray:
+    """[..., 2] -> [..., 3] in camera space, z = 1."""
+    offset = (points_px - [camera.width / 2, camera.height / 2]) / camera.focal_px
+    return np.concatenate([offset, np.ones((*offset.shape[:-1], 1))], -1)
+
+
+def _background(light: EnvironmentLight, shot: SyntheticShot, camera: PinholeCamera) -> np.ndarray:
+    """[H, W, 3] what the camera sees past the head: the light itself."""
+    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1) + 0.5
+    world_from_camera = shot.world_from_head @ shot.camera_from_head[:3, :3].T
+    return latlong_lookup(light.image, normalised(_camera_directions(pixels, camera)) @ world_from_camera.T)
+
+
+def _primary_hits(surface: SyntheticSurface, shot: SyntheticShot, camera: PinholeCamera,
+                  points_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Rays through image points [N, 2]: which hit [M], their head-space directions [M, 3] and what lies there."""
+    rotation, translation = shot.camera_from_head[:3, :3], shot.camera_from_head[:3, 3]
+    directions = (_camera_directions(points_px, camera) @ rotation).astype(np.float32)
+    origins = np.broadcast_to(-translation @ rotation, directions.shape)
+    face, bary, depth = surface.scene.intersect(origins, directions)
+    hit = np.nonzero(face >= 0)[0]
+    points = surface.points(face[hit], bary[hit])
+    values = {name: sample_bilinear(getattr(surface.materials, name), points.uv) for name in TEXTURES}
+    inside = sample_bilinear(surface.materials.mask, points.uv) > 0.5
+    return hit, directions[hit], {**values, "points": points, "normal": points.normal, "depth": depth[hit],
+                                  "mask": inside, "head": np.ones(len(hit), np.float32)}
+
+
+def _shade(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray, shot: SyntheticShot,
+           directions: np.ndarray,
+           values: dict, samples: GlossSamples, choice: np.ndarray) -> np.ndarray:
+    """[M, 3] radiance towards the camera: albedo / pi times irradiance, plus the glossy lobe."""
+    gloss = glossy_radiance(surface, light, irradiance, shot.world_from_head, values["points"],
+                            -normalised(directions), values["roughness"], samples, choice)
+    diffuse = values["albedo"] * sample_bilinear(irradiance, values["points"].uv) / np.float32(np.pi)
+    return diffuse + values["specular"][:, None] * gloss

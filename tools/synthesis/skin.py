@@ -1,0 +1,207 @@
+"""Procedural skin: reflectance textures for the head model from a seed.
+
+Tone follows two pigments, melanin and haemoglobin, whose amounts vary over the face and absorb each colour channel
+differently (after [Tsumura2003]; the numbers here are chosen by eye). Patterns live in the head's 3D space, so UV seams
+do not show.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from shared.capture.landmarks import BROW_LEFT, BROW_RIGHT
+from shared.geometry.mesh import interpolate, normalised, rasterize_uv
+from tools.synthesis.head import Head
+from tools.synthesis.noise import value_noise
+from tools.synthesis.surface import Materials
+
+BARE_SKIN = np.array([0.86, 0.75, 0.66])
+MELANIN_ABSORPTION = np.array([0.55, 0.95, 1.5])
+HAEMOGLOBIN_ABSORPTION = np.array([0.13, 0.78, 0.52])
+MASK_SEGMENTS = ("forehead", "lids", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "lips", "chin")
+COLLAR_Y_MM, COLLAR_SLOPE = -163.0, -0.5
+CLOTH_ALBEDO = (0.07, 0.085, 0.11)
+IRIS_RADIUS_MM = 6.0
+PUPIL_RADIUS_MM = 2.2
+# Amounts added per region: melanin, haemoglobin, specular intensity, roughness.
+REGIONS = {
+    "lips": (0.10, 0.75, 0.22, -0.11), "lids": (0.10, 0.16, 0.05, -0.02), "ears": (0.0, 0.32, 0.0, 0.02),
+    "nose": (0.0, 0.14, 0.20, -0.07), "forehead": (0.02, 0.0, 0.10, -0.04), "chin": (0.0, 0.06, 0.04, 0.0),
+    "scalp": (0.0, 0.0, -0.12, 0.05), "neck": (0.05, 0.03, -0.08, 0.03), "inner_mouth": (0.5, 1.3, 0.0, -0.1),
+    "eye_sockets": (0.3, 0.8, 0.0, 0.0),
+}
+BLUSH = {50: 20.0, 280: 20.0, 4: 11.0}
+"""Landmarks on which the skin is redder, with the radius in mm: both cheeks and the tip of the nose."""
+
+
+@dataclass(frozen=True)
+class Complexion:
+    """tone: amount of melanin, about 0.15 (fair) to 1.8 (dark); freckles, stubble, hair: 0 to 1; hair and iris
+    colours: linear albedo."""
+
+    tone: float = 0.35
+    freckles: float = 0.5
+    stubble: float = 0.3
+    hair: float = 0.9
+    hair_colour: tuple[float, float, float] = (0.055, 0.036, 0.025)
+    iris_colour: tuple[float, float, float] = (0.075, 0.10, 0.12)
+
+
+class SkinPainter:
+    """Paints textures of size x size for one head.
+
+    place [size, size, 3]: the surface's points, mm; landmarks [468, 3], mm.
+    """
+
+    def __init__(self, head: Head, size: int, seed: int):
+        self.size = size
+        self._rng = np.random.default_rng([seed, 5])
+        self._head, mesh = head, head.mesh
+        face, bary = rasterize_uv(mesh, size)
+        empty = face < 0
+        self._fill = tuple(distance_transform_edt(empty, return_distances=False, return_indices=True))
+        face, bary = face[self._fill], bary[self._fill]
+        self._segment = head.face_segment[face]
+        self.place = interpolate(mesh.vertices, mesh.faces, face.ravel(), bary.reshape(-1, 3)).reshape(size, size, 3)
+        self.landmarks = head.landmarks()
+
+    def inside(self, *names: str) -> np.ndarray:
+        """[size, size] bool: the named segments."""
+        return np.isin(self._segment, [self._head.segment_names.index(name) for name in names])
+
+    def region(self, *names: str, softness_mm: float = 2.5) -> np.ndarray:
+        """[size, size] in [0, 1]: the named segments with soft borders."""
+        inside = self.inside(*names).astype(np.float32)
+        return cv2.GaussianBlur(inside, (0, 0), max(softness_mm * self._texels_per_mm(), 0.5))
+
+    def noise(self, wavelength_mm: float) -> np.ndarray:
+        """[size, size] smooth random pattern over the surface, mean 0, standard deviation about 1."""
+        return value_noise(self.place, wavelength_mm, self._rng).astype(np.float32)
+
+    def paint(self, complexion: Complexion) -> Materials:
+        """All textures."""
+        melanin, haemoglobin, specular, roughness = self._amounts(complexion)
+        absorbed = melanin[..., None] * MELANIN_ABSORPTION + haemoglobin[..., None] * HAEMOGLOBIN_ABSORPTION
+        albedo = BARE_SKIN * np.exp(-absorbed)
+        hair = self._hair(complexion)
+        albedo = albedo * (1 - hair[..., None]) + np.array(complexion.hair_colour) * hair[..., None]
+        cloth = self._cloth()
+        weave = np.array(CLOTH_ALBEDO) * (1 + 0.12 * self.noise(1.5))[..., None]
+        albedo += cloth[..., None] * (weave - albedo)
+        specular -= 0.25 * hair + 0.5 * cloth
+        roughness += 0.08 * hair + 0.2 * cloth
+        albedo, specular, roughness = self._eyes(albedo, specular, roughness, complexion)
+        mask = self.inside(*MASK_SEGMENTS)
+        return Materials(np.clip(albedo, 0.01, 0.9).astype(np.float32), np.clip(specular, 0.1, 1.2).astype(np.float32),
+                         np.clip(roughness, 0.22, 0.7).astype(np.float32), mask.astype(np.float32))
+
+    def _amounts(self, complexion: Complexion) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Melanin, haemoglobin, specular intensity and roughness of bare skin, each [size, size]."""
+        tone = complexion.tone
+        melanin = tone * (1 + 0.10 * self.noise(30) + 0.06 * self.noise(7) + 0.05 * self.noise(1.6))
+        melanin += complexion.freckles * self._freckles() + self._moles()
+        haemoglobin = 0.55 + 0.07 * self.noise(16) + 0.06 * self.noise(5) + 0.05 * self.noise(2)
+        specular = 0.72 + 0.06 * self.noise(14) + 0.05 * self.noise(2.5)
+        roughness = 0.45 + 0.015 * self.noise(20) + 0.015 * self.noise(3)
+        for landmark, radius in BLUSH.items():
+            distance = np.linalg.norm(self.place - self.landmarks[landmark], axis=-1)
+            haemoglobin += 0.32 * np.exp(-0.5 * (distance / radius) ** 2)
+        for name, (more_melanin, more_haemoglobin, more_specular, more_roughness) in REGIONS.items():
+            region = self.region(name, softness_mm=0.8 if name == "lips" else 4.0)
+            melanin = melanin + more_melanin * region
+            haemoglobin = haemoglobin + more_haemoglobin * region
+            specular = specular + more_specular * region
+            roughness = roughness + more_roughness * region
+        return melanin, haemoglobin, specular, roughness
+
+    def _freckles(self) -> np.ndarray:
+        """Small dark spots where a coarse pattern allows them, mostly on nose and cheeks."""
+        where = self.region("nose", "cheek_left", "cheek_right", "forehead", softness_mm=6) * 0.8 + 0.2
+        spots = np.clip(self.noise(2.4) - 1.1, 0, 1) * np.clip(0.6 + 0.5 * self.noise(25), 0, 1)
+        return 0.55 * spots * where
+
+    def _moles(self) -> np.ndarray:
+        """A handful of single dark spots on cheeks, chin, forehead and neck."""
+        inside = self.inside("cheek_left", "cheek_right", "chin", "forehead", "neck")
+        places = self.place[inside]
+        moles = np.zeros((self.size, self.size))
+        for index in self._rng.integers(len(places), size=7):
+            distance = np.linalg.norm(self.place - places[index], axis=-1)
+            moles += self._rng.uniform(0.4, 1.1) / (1 + (distance / self._rng.uniform(0.6, 1.3)) ** 6)
+        return moles
+
+    def _hair(self, complexion: Complexion) -> np.ndarray:
+        """[size, size] share of the surface that hair covers: brows, cropped hair, stubble."""
+        grain = np.clip(0.93 + 0.12 * self.noise(0.9) + 0.06 * self.noise(5), 0, 1)
+        line = np.clip((self.region("scalp", softness_mm=7) - 0.5 + 0.09 * self.noise(2.5)) / 0.35, 0, 1)
+        beard = self.region("chin", "jaw", "upper_lip_skin", softness_mm=8) * (1 - self.region("lips", softness_mm=2))
+        beard *= np.clip(0.6 + 0.3 * self.noise(12), 0, 1) * np.clip(0.5 + 0.6 * self.noise(1.3), 0, 1)
+        cover = complexion.hair * line * grain
+        return np.clip(np.maximum(np.maximum(cover, 0.75 * complexion.stubble * beard), self._brows()), 0, 1)
+
+    def _cloth(self) -> np.ndarray:
+        """[size, size] share of the surface that the shirt covers: all below a plane that rises to the back."""
+        height = self.place[..., 1] - (COLLAR_Y_MM + COLLAR_SLOPE * self.place[..., 2])
+        return np.clip(0.5 - height / 4, 0, 1)
+
+    def _brows(self) -> np.ndarray:
+        """[size, size] hairs drawn as strokes from the lower outline of each brow, slanting outwards."""
+        scale = 4
+        canvas = np.zeros((self.size * scale, self.size * scale), np.uint8)
+        for brow in (BROW_RIGHT, BROW_LEFT):
+            upper, lower = self._landmarks_uv(brow[:5]), self._landmarks_uv(brow[:4:-1])
+            for along in self._rng.random(420):
+                start, end = _along(lower, along), _along(upper, along)
+                onwards = _along(upper, max(along - 0.16, 0.0)) - _along(upper, max(along - 0.16, 0.0) + 0.1)
+                root = start + (end - start) * self._rng.uniform(-0.05, 0.75)
+                slant = np.clip(0.25 + 1.1 * (1 - along), 0.2, 1.2)
+                tip = root + (end - start) * 0.35 + onwards * slant * self._rng.uniform(0.6, 1.4)
+                line = np.stack([root, tip]) * [self.size, -self.size] + [0, self.size]
+                width = max(1, round(0.32 * self._texels_per_mm() * scale))
+                cv2.line(canvas, *np.int32(np.round(line * scale)), 255, width, cv2.LINE_8)
+        strokes = cv2.resize(canvas, (self.size, self.size), interpolation=cv2.INTER_AREA) / np.float32(255)
+        return 0.9 * strokes
+
+    def _eyes(self, albedo: np.ndarray, specular: np.ndarray, roughness: np.ndarray,
+              complexion: Complexion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """White of the eye, iris and pupil on the eyeballs, looking straight ahead."""
+        eye = self.inside("eyes")
+        grain = self.noise(0.8)
+        for side in (-1, 1):
+            ball = eye & (np.sign(self.place[..., 0]) == side)
+            places = self.place[ball]
+            centre = 0.5 * (places.min(0) + places.max(0))
+            outward = normalised(places - centre)
+            radius = np.linalg.norm(places - centre, axis=1).mean() * np.hypot(outward[:, 0], outward[:, 1])
+            front = outward[:, 2] > 0
+            iris = front * np.clip((IRIS_RADIUS_MM - radius) / 0.6 + 0.5, 0, 1)
+            pupil = front * np.clip((PUPIL_RADIUS_MM - radius) / 0.4 + 0.5, 0, 1)
+            rim = np.clip(1.15 - 0.5 * (radius / IRIS_RADIUS_MM) ** 4 + 0.25 * grain[ball], 0.2, 2)
+            white = np.array([0.62, 0.55, 0.51]) * (1 + 0.03 * grain[ball])[:, None]
+            colour = white + iris[:, None] * (np.array(complexion.iris_colour) * rim[:, None] - white)
+            albedo[ball] = colour * (1 - pupil)[:, None] + 0.012 * pupil[:, None]
+        specular[eye], roughness[eye] = 1.0, 0.24
+        return albedo, specular, roughness
+
+    def _landmarks_uv(self, indices: tuple[int, ...]) -> np.ndarray:
+        """[N, 2] uv of landmarks."""
+        index = list(indices)
+        mesh = self._head.mesh
+        return interpolate(mesh.uvs, mesh.face_uvs, self._head.landmark_face[index], self._head.landmark_bary[index])
+
+    def _texels_per_mm(self) -> float:
+        """Mean resolution of the texture over the face, from the distance between the cheeks' landmarks."""
+        uv = self._landmarks_uv((50, 280))
+        return float(np.linalg.norm(uv[0] - uv[1]) * self.size
+                     / np.linalg.norm(self.landmarks[50] - self.landmarks[280]))
+
+
+def _along(points: np.ndarray, part: float) -> np.ndarray:
+    """Point at a fraction of a polyline's length in vertices: points [N, 2], part in [0, 1]."""
+    position = np.clip(part, 0, 1) * (len(points) - 1)
+    index = min(int(position), len(points) - 2)
+    return points[index] + (points[index + 1] - points[index]) * (position - index)

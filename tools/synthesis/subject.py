@@ -1,0 +1,247 @@
+"""Make a head-turn clip whose every truth is known: the demo subject, and at tiny size the tests' subject.
+
+    python -m tools.synthesize DEST [--preset demo|tiny] [--size 400] [--frames 48] [--light lamp] [--chart] ...
+
+Writes:  DEST/subject.yaml, capture.json, the clip (video.avi, or frames/%04d.png), synthesis.json (how it was made);
+         gt/: mesh.obj, albedo.exr, specular.exr, roughness.exr, mask.exr (UV), envmap.exr, poses.npz, and for some
+         frames frames/NNNN_*.exr and .png; relight/: the same head under other lights. tools/score.py reads all of it.
+Method:  a random head of the head model with procedural skin, bumps, bust and light; direct light with one diffuse
+         bounce and the GGX lobe, traced with embree (irradiance, camera); sensor noise, 8-bit sRGB.
+The clip is FFV1 in AVI: of the encoders in OpenCV's wheel the lossy ones shift colours by 2 to 3 codes on their way
+through YUV 4:2:0, FFV1 returns every code value. The same arguments give the same bytes, whatever the number of
+processes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from shared.errors import InputError
+from shared.geometry.transforms import rigid, rotation_from_vector, world_from_head
+from shared.io.arrays import save_arrays, write_json
+from shared.rendering.envmap import latlong_directions
+from shared.tracking.head_model import HeadModel
+from shared.tracking.models import load_head_model
+from tools.synthesis import output
+from tools.synthesis.camera import PictureQuality, PinholeCamera
+from tools.synthesis.chart import place_chart
+from tools.synthesis.head import PITCH_DEG, YAW_DEG, Head, face_part, head_turn, random_head
+from tools.synthesis.irradiance import IrradianceQuality, SyntheticShot
+from tools.synthesis.light import ENVIRONMENTS, procedural_environment
+from tools.synthesis.render import RenderQuality, Scene, render
+from tools.synthesis.skin import Complexion, SkinPainter
+
+SENSOR_MM, FPS = 22.3, 25.0
+DISTANCE_PER_FOCAL = 950.0 / 60.0
+"""The camera stands where the head fills the same part of the picture, whatever its lens."""
+
+TOP_MARGIN_MM = 27.0
+WITH_CHART = 1.5
+"""Width of a picture that holds a chart, relative to its height."""
+FACE_RADIANCE = 0.32
+"""Mean linear radiance of the face, seen from the front, to which the exposure is set."""
+RELIGHT_YAWS_DEG = {"front": 0.0, "left15": -15.0, "right15": 15.0}
+
+
+@dataclass(frozen=True)
+class SynthesisSettings:
+    """Everything that decides the result.
+
+    level: subdivisions of the head model. noise: standard deviation of the sensor at full scale. lights: the clip's,
+    then those of relight/. truth_frames: how many frames get all buffers. mantissa_bits: precision of the truth on
+    disk. face_truth_only: gt/mesh.obj holds the face without the rest of the head. chart: a colour chart stands beside
+    the head, and the picture is half as wide again to hold it. gloss: factor on the specular intensity; 0: matte.
+    """
+
+    size: int = 400
+    frames: int = 48
+    seed: int = 0
+    eyes: str = "open"
+    tone: float = 0.35
+    lights: tuple[str, ...] = ("room", "studio", "sky")
+    light_height: int = 64
+    noise: float = 0.006
+    level: int = 2
+    texture: int = 1024
+    focal_mm: float = 60.0
+    yaw_deg: float = YAW_DEG
+    pitch_deg: float = PITCH_DEG
+    truth_frames: int = 8
+    mantissa_bits: int = 10
+    face_truth_only: bool = False
+    video: str = "video.avi"
+    chart: bool = False
+    gloss: float = 1.0
+    irradiance: IrradianceQuality = IrradianceQuality()
+    picture: PictureQuality = PictureQuality()
+
+
+PRESETS = {
+    "demo": SynthesisSettings(),
+    "tiny": SynthesisSettings(size=144, frames=12, level=0, texture=128, truth_frames=1, mantissa_bits=4,
+                              face_truth_only=True, lights=("room",), light_height=32, noise=0.0015,
+                              video="frames/%04d.png",
+                              irradiance=IrradianceQuality(size=160, directions=768)),
+}
+
+
+def synthesize(destination: Path, settings: SynthesisSettings, processes: int) -> None:
+    """Makes the subject in `destination`, which may not hold one yet. Errors: InputError."""
+    if (destination / "subject.yaml").exists():
+        raise InputError("holds a subject already", where=str(destination), hint="choose another folder or remove it")
+    head = random_head(head_model(settings.level), settings.seed, settings.eyes == "closed")
+    materials = SkinPainter(head, settings.texture, settings.seed).paint(Complexion(tone=settings.tone))
+    materials = replace(materials, specular=settings.gloss * materials.specular)
+    lights = tuple(light_of(name, settings) for name in settings.lights)
+    distance, height = camera_place(head, settings)
+    chart = place_chart(distance, height, settings.seed) if settings.chart else None
+    scene = Scene(head.mesh, materials, lights, chart)
+    width = round(WITH_CHART * settings.size) if settings.chart else settings.size
+    camera = PinholeCamera(width, settings.size, settings.focal_mm / SENSOR_MM * settings.size)
+    shots = plan_shots(head, settings)
+    truth = np.unique(np.linspace(0, settings.frames - 1, settings.truth_frames).round().astype(int))
+    destination.mkdir(parents=True, exist_ok=True)
+    mesh = face_part(head) if settings.face_truth_only else head.mesh
+    output.write_scene_truth(destination / "gt", scene, mesh, settings.mantissa_bits)
+    poses = np.stack([shot.camera_from_head for shot in shots[:settings.frames]])
+    output.write_poses(destination / "gt" / "poses.npz", poses, camera, truth)
+    with_buffers = [i in truth or i >= settings.frames for i in range(len(shots))]
+    quality = RenderQuality(settings.irradiance, settings.picture, settings.seed)
+    pictures = render(scene, shots, camera, quality, with_buffers, processes)
+    _write_clip(destination, settings, camera, truth, islice(pictures, settings.frames))
+    if len(lights) > 1:
+        _write_relight(destination / "relight", settings, scene, shots[settings.frames:], pictures)
+    write_json(destination / "synthesis.json", asdict(settings))
+    # Last, so that an interrupted run leaves no subject.
+    output.write_description(
+        destination, camera, focal_mm=settings.focal_mm, sensor_mm=SENSOR_MM * width / settings.size,
+        frames=settings.frames, fps=FPS, video=settings.video,
+    )
+
+
+def _write_clip(destination: Path, settings: SynthesisSettings, camera: PinholeCamera, truth: np.ndarray,
+                pictures: Iterable[dict[str, np.ndarray]]) -> None:
+    clip = output.ClipWriter(destination / settings.video, (camera.width, camera.height), FPS)
+    for index, images in enumerate(tqdm(pictures, "frames", settings.frames, disable=None)):
+        clip.add(output.sensor_codes(images["radiance"], settings.noise, settings.seed * 1000 + index))
+        if index in truth:
+            stem = str(destination / "gt" / "frames" / f"{index:04d}")
+            output.write_buffers(stem, images, images, settings.mantissa_bits)
+    clip.close()
+
+
+def _write_relight(folder: Path, settings: SynthesisSettings, scene: Scene, shots: list[SyntheticShot],
+                   pictures: Iterable[dict[str, np.ndarray]]) -> None:
+    folder.mkdir(exist_ok=True)
+    for name, light in zip(settings.lights[1:], scene.lights[1:], strict=True):
+        output.write_environment(folder / f"{name}_envmap.exr", light)
+    cases = [f"{name}_{view}" for name in settings.lights[1:] for view in RELIGHT_YAWS_DEG]
+    for case, images in zip(cases, pictures, strict=True):
+        output.write_buffers(str(folder / case), images, ("radiance", "mask", "head"), settings.mantissa_bits)
+    save_arrays(folder / "poses.npz", **{view: shot.camera_from_head for view, shot in
+                                         zip(RELIGHT_YAWS_DEG, shots, strict=False)})
+
+
+def head_model(level: int) -> HeadModel:
+    """The head model, subdivided so often."""
+    model = load_head_model()
+    for _ in range(level):
+        model = model.subdivided()
+    return model
+
+
+def light_of(name: str, settings: SynthesisSettings) -> np.ndarray:
+    """The named environment, scaled so that skin that faces the camera has a radiance of FACE_RADIANCE."""
+    environment = procedural_environment(name, settings.seed, settings.light_height)
+    directions = latlong_directions(environment.shape[0])
+    solid_angle = np.sin(np.arccos(directions[..., 1])) * (np.pi / environment.shape[0]) ** 2
+    cosine = np.clip(directions[..., 2], 0, 1)
+    irradiance = (environment * (cosine * solid_angle)[..., None]).sum((0, 1)).mean()
+    skin_albedo = 0.52 * np.exp(-settings.tone)
+    return (environment * (FACE_RADIANCE * np.pi / (irradiance * skin_albedo))).astype(np.float32)
+
+
+def camera_place(head: Head, settings: SynthesisSettings) -> tuple[float, float]:
+    """The camera's distance from the head's origin and its height above it, mm."""
+    height = head.mesh.vertices[:, 1].max() + TOP_MARGIN_MM - 0.5 * SENSOR_MM * DISTANCE_PER_FOCAL
+    return DISTANCE_PER_FOCAL * settings.focal_mm, height
+
+
+def plan_shots(head: Head, settings: SynthesisSettings) -> list[SyntheticShot]:
+    """The clip's frames, then three views under each further light."""
+    distance, height = camera_place(head, settings)
+    poses = list(head_turn(settings.frames, distance, height, settings.seed, settings.yaw_deg, settings.pitch_deg))
+    light = [0] * settings.frames
+    for index in range(1, len(settings.lights)):
+        poses += [relight_pose(yaw, height, distance) for yaw in RELIGHT_YAWS_DEG.values()]
+        light += [index] * len(RELIGHT_YAWS_DEG)
+    turns = world_from_head(np.stack(poses), "head")
+    return [SyntheticShot(pose, turn, which, settings.seed * 1000 + i)
+            for i, (pose, turn, which) in enumerate(zip(poses, turns, light, strict=True))]
+
+
+def relight_pose(yaw_deg: float, height_mm: float, distance_mm: float) -> np.ndarray:
+    """camera_from_head [4, 4] turned about the head's own axis."""
+    flip = np.diag([1.0, -1.0, -1.0])
+    turn = rotation_from_vector(np.array([0.0, np.radians(yaw_deg), 0.0]))
+    return rigid(flip @ turn, np.array([0.0, height_mm, distance_mm]))
+
+
+def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
+    """Command line -> destination, settings, number of processes."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("destination", type=Path, help="folder of the new subject")
+    parser.add_argument("--preset", choices=PRESETS, default="demo", help="values of all that follows (default demo)")
+    parser.add_argument("--size", type=int, help="width and height, pixels")
+    parser.add_argument("--frames", type=int, help="length of the clip")
+    parser.add_argument("--seed", type=int, help="decides head, skin, light and motion")
+    parser.add_argument("--eyes", choices=("open", "closed"))
+    parser.add_argument("--tone", type=float, help="melanin: 0.15 fair to 1.6 dark")
+    parser.add_argument("--light", choices=ENVIRONMENTS, help="the clip's light")
+    parser.add_argument("--focal", dest="focal_mm", type=float, help="focal length, mm, on a sensor 22.3 mm wide")
+    parser.add_argument("--yaw", dest="yaw_deg", type=float, help="how far the head turns to each side, degrees")
+    parser.add_argument("--pitch", dest="pitch_deg", type=float, help="how far it nods up and down, degrees")
+    parser.add_argument("--noise", type=float, help="sensor noise at full scale, share of it")
+    parser.add_argument("--gloss", type=float, help="factor on the skin's specular intensity; 0: matte")
+    parser.add_argument("--chart", action="store_true", help="a colour chart beside the head, in a wider picture")
+    parser.add_argument("--processes", type=int, default=2, help="worker processes (default 2)")
+    options = parser.parse_args(arguments)
+    settings = PRESETS[options.preset]
+    given = {name: getattr(options, name) for name in
+             ("size", "frames", "seed", "eyes", "tone", "noise", "focal_mm", "yaw_deg", "pitch_deg", "gloss")}
+    settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
+    settings = replace(settings, chart=options.chart)
+    if options.light:
+        others = tuple(name for name in settings.lights if name != options.light)
+        settings = replace(settings, lights=(options.light, *others)[:len(settings.lights)])
+    return options.destination, _checked(settings), options.processes
+
+
+def _checked(settings: SynthesisSettings) -> SynthesisSettings:
+    for name, low, high in (("size", 64, 2048), ("frames", 8, 1000), ("seed", 0, 10**6), ("tone", 0.05, 2.0),
+                            ("noise", 0.0, 0.1), ("focal_mm", 15.0, 500.0), ("yaw_deg", 0.0, 60.0),
+                            ("pitch_deg", 0.0, 40.0), ("gloss", 0.0, 2.0)):
+        value = getattr(settings, name)
+        if not low <= value <= high:
+            raise InputError("out of range", where=f"--{name.split('_')[0]}", got=value, expected=f"{low} to {high}")
+    return settings
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; exit code 0, or 2 when the input is at fault."""
+    try:
+        destination, settings, processes = parse(arguments)
+        synthesize(destination, settings, processes)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"{destination}: {settings.frames} frames of {settings.size} x {settings.size} px with truth")
+    return 0
