@@ -14,13 +14,15 @@ said to mean:
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
 from shared.appearance.albedo_scale import scale_prior
-from shared.appearance.solver import AppearanceSolver
+from shared.appearance.problem import AppearanceProblem, AppearanceState
+from shared.appearance.sample_errors import SampleErrors
 from shared.compute.robust import ROBUST_SCALE
 from shared.geometry.mesh import Mesh, normalised, segments_at
 from shared.imaging.color import LUMINANCE
@@ -51,24 +53,25 @@ def face_regions(
     return {"eyes": (cKDTree(eyes).query(positions)[0] < NEAR_EYES_MM) & ~forehead, "forehead": forehead}
 
 
-def diagnostics_of(solver: AppearanceSolver, regions: Mapping[str, np.ndarray] | None = None) -> dict[str, float]:
-    """The diagnostics by name of a solver at its solution, baked; regions [P] bool: see face_regions."""
-    capture = solver.capture
+def diagnostics_of(
+    problem: AppearanceProblem, state: AppearanceState, regions: Mapping[str, np.ndarray] | None = None
+) -> dict[str, float]:
+    """The diagnostics by name of a problem at a solved state; regions [P] bool by name: see face_regions."""
+    capture, settings = problem.capture, problem.settings
     some = slice(None, None, -(-len(capture.points) // POINTS))
-    part = solver.subset(some)
-    if solver.settings.specular:
-        part.bake_lobes()
-    model = part.model(*part.forward(part.state.light))
-    gains, misfit = frame_gains(part, model), misfits(part, model)
-    weight = part.trust * torch.from_numpy(part.capture.skin.astype(np.float32))[None, :, None]
-    radiance = ((weight * part.colours).sum((1, 2)) / weight.sum()).double().numpy()
+    part = problem.take(some)
+    seen = replace(state, albedo=state.albedo[some])
+    model = seen.radiance(*part.transport(seen).forward(seen.light))
+    gains, residual = frame_gains(part.errors, model), normalised_residuals(part.errors, model)
+    weight = part.skin_weight
+    radiance = ((weight * part.errors.colours).sum((1, 2)) / weight.sum()).double().numpy()
     skin = capture.skin
     diagnostics = {
         "frame_gain": gains.mean(1).std(),
         "frame_tint": (gains[:, 0] - gains[:, 2]).std(),
-        "albedo_by_orientation": by_orientation(solver.state.albedo[skin], capture.points.normals[skin]),
-        "unlikely_colour": unlikely_colour(radiance, solver.settings.white_sigma),
-        **{f"covered_{name}": covered_share(misfit, region[some]) for name, region in (regions or {}).items()},
+        "albedo_by_orientation": by_orientation(state.albedo[skin], capture.points.normals[skin]),
+        "unlikely_colour": unlikely_colour(radiance, settings.white_sigma),
+        **{f"covered_{name}": covered_share(residual, region[some]) for name, region in (regions or {}).items()},
     }
     return {name: round(float(value), 4) for name, value in diagnostics.items()}
 
@@ -96,24 +99,25 @@ def diagnostic_warnings(measured: dict[str, float], moves: str = "head") -> list
     return found
 
 
-def misfits(solver: AppearanceSolver, model: torch.Tensor) -> np.ndarray:
+def normalised_residuals(errors: SampleErrors, model: torch.Tensor) -> np.ndarray:
     """[P] mean absolute residual of the model [3, P, F] over the assumed noise."""
-    error, inactive = solver.errors(model)
-    total = (solver.trust * (~inactive) * error.sqrt()).sum((0, 2))
-    return (total / (3.0 * solver.trust.sum((0, 2))).clamp_min(1e-9)).double().numpy()
+    error, inactive = errors.errors(model)
+    total = (errors.view_weight * (~inactive) * error.sqrt()).sum((0, 2))
+    return (total / (3.0 * errors.view_weight.sum((0, 2))).clamp_min(1e-9)).double().numpy()
 
 
-def covered_share(misfit: np.ndarray, region: np.ndarray) -> float:
-    """Share of a region's points [P] bool whose misfit [P] is far above the median; 0 where the region has too few."""
+def covered_share(residual: np.ndarray, region: np.ndarray) -> float:
+    """Share of a region's points [P] bool whose residual [P] is far above the median; 0 where the region has too few.
+    """
     if region.sum() < FEWEST_POINTS:
         return 0.0
-    return float((misfit[region] > FAR_WORSE * np.median(misfit)).mean())
+    return float((residual[region] > FAR_WORSE * np.median(residual)).mean())
 
 
-def frame_gains(solver: AppearanceSolver, model: torch.Tensor) -> np.ndarray:
+def frame_gains(errors: SampleErrors, model: torch.Tensor) -> np.ndarray:
     """[F, 3] median logarithm of the samples over the model [3, P, F]; 0 where a frame shows nothing."""
-    used = (solver.saturation == 0) & (solver.trust > 0) & (model > LEAST_MODEL) & (solver.colours > LEAST_MODEL)
-    ratio = torch.log(solver.colours.clamp_min(1e-6) / model.clamp_min(1e-6))
+    used = (errors.saturation == 0) & (errors.view_weight > 0) & (model > LEAST_MODEL) & (errors.colours > LEAST_MODEL)
+    ratio = torch.log(errors.colours.clamp_min(1e-6) / model.clamp_min(1e-6))
     ratio = torch.where(used, ratio, torch.full_like(ratio, torch.nan))
     return ratio.nanmedian(dim=1).values.nan_to_num().T.double().numpy()
 

@@ -1,18 +1,21 @@
-"""The whole appearance fit: light steps from coarse to fine, a stop on held-out frames."""
+"""The whole appearance fit: steps of everything from coarse lights to fine ones, a stop on held-out frames."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
+from enum import Enum
 
 import numpy as np
+import torch
 
-from shared.appearance.light_step import LightStep
+from shared.appearance.light_step import LinearisedFit
 from shared.appearance.light_weights import weigh_samples
-from shared.appearance.local_roughness import SpecularEquations, local_roughness
+from shared.appearance.local_roughness import SpecularEquations
 from shared.appearance.observations import Capture
-from shared.appearance.solver import LARGEST_ROUGHNESS_STEP, AppearanceSettings, AppearanceSolver, AppearanceState
+from shared.appearance.problem import AppearanceProblem, AppearanceSettings, AppearanceState
+from shared.appearance.projection import LARGEST_ROUGHNESS_STEP, changed_roughness
+from shared.appearance.sample_errors import SampleErrors
 
 _SHAPING_STEPS, _SHAPED = 3, 0.1
 """Without highlights at least as many steps from a uniform light, until one changes the fitted residual by less than
@@ -37,13 +40,73 @@ resolution: the specular intensity and the scale follow priors as well as sample
 model (an expression that changes, a palette of few colours) they can lead away from it."""
 
 
+class Phase(Enum):
+    """What the steps of a resolution are for."""
+
+    SHAPING = "shaping"
+    """The light finds its lamps, without highlights."""
+    SOLVING = "solving"
+    """All unknowns together."""
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What a step found.
+
+    fitted, held_out: residuals; cost: before it; rescaled: see ResolvedFit; skin_prior: what the prior on skin says
+    against its albedo; specular_intensity, roughness; light_weights: of several lights, see weigh_samples; rise: by
+    what factor the robust loss on fitted samples rose; frame_errors [F]: each frame's mean absolute residual.
+    """
+
+    fitted: float
+    held_out: float
+    cost: float
+    rescaled: float
+    skin_prior: float
+    specular_intensity: float
+    roughness: float
+    light_weights: tuple[float, ...]
+    rise: float
+    frame_errors: np.ndarray
+
+    def judged(self, capture: Capture, independent: float) -> float:
+        """The residual to judge by, raised by what the prior on skin says against the albedo: of held-out frames, of
+        the fitted ones in a clip too short to hold frames out.
+
+        A residual r of count independent samples and a prior's cost p together are as likely as a residual of
+        r sqrt(1 + 2 p / count) alone: no frame shows what samples leave open.
+        """
+        residual, share = self.held_out, 1.0 - capture.fitted.mean()
+        if capture.fitted.all():
+            residual, share = self.fitted, 1.0
+        return residual * (1.0 + 2.0 * self.skin_prior / (share * independent)) ** 0.5
+
+    def record(self, model: str, resolution: int, number: int, phase: Phase) -> dict:
+        """The line of solve.json: step number of a phase under a light of a model and resolution."""
+        several = {"light_trust": list(self.light_weights)} if self.light_weights else {}
+        return several | {
+            "fitted": self.fitted,
+            "held_out": self.held_out,
+            "cost": self.cost,
+            "rescaled": self.rescaled,
+            "skin_prior": self.skin_prior,
+            "specular_intensity": self.specular_intensity,
+            "roughness": self.roughness,
+            "light": model,
+            "resolution": resolution,
+            "step": number,
+            "shaping": phase is Phase.SHAPING,
+        }
+
+
 @dataclass(frozen=True)
 class Solution:
-    """The last State of those that are best by held-out residual; iterations: one record per step; fitted and held_out:
+    """The last state of those that are best by held-out residual; iterations: one record per step; fitted and held_out:
     its residuals; local_roughness_fit: where roughness varies over the skin, how, and roughness_record what the
-    held-out frames said to that; trusted: whether highlights took part to the end; frame_errors [F]: each frame's mean
-    absolute residual; local_specular: where the specular intensity varies with the face's segments, how; light_weights:
-    of several lights, how much samples of each count against those of the light that the model follows best."""
+    held-out frames said to that; highlights_count: whether highlights took part to the end; frame_errors [F]: each
+    frame's mean absolute residual; local_specular: where the specular intensity varies with the face's segments, how;
+    light_weights: of several lights, how much samples of each count against those of the light that the model follows
+    best."""
 
     state: AppearanceState
     iterations: tuple[dict, ...]
@@ -51,10 +114,18 @@ class Solution:
     held_out: float
     local_roughness_fit: SpecularEquations | None = None
     roughness_record: dict = field(default_factory=dict)
-    trusted: bool = True
+    highlights_count: bool = True
     frame_errors: np.ndarray | None = None
     local_specular: SpecularEquations | None = None
     light_weights: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class FitState:
+    """What a step starts from: the unknowns, and how samples count."""
+
+    appearance: AppearanceState
+    errors: SampleErrors
 
 
 def fit_appearance(
@@ -71,129 +142,111 @@ def fit_appearance(
     is may win, too; least: steps from it before one that serves little may be the last; shapes: the start's light is
     not one to judge highlights by, being of another model, or found without any.
 
-    The first steps, and those after a change of the light's model, only give the light its shape ("shaping" in their
-    records); highlights, which then begin to say something about the scale, take part after those, but not again after
+    The first steps, and those after a change of the light's model, only give the light its shape (Phase.SHAPING);
+    highlights, which then begin to say something about the scale, take part after those, but not again after
     a step that had to be undone. Only states after the first steps, of the light model asked for, can win, or the one
     that a step was undone to; of those that do about as well the last, whose scale has come to rest.
     """
-    solver = AppearanceSolver(capture, settings)
-    # A clip too short to hold frames out is judged by the fitted ones.
-    name, share = ("fitted", 1.0) if capture.fitted.all() else ("held_out", 1.0 - capture.fitted.mean())
-    judge = partial(_judged, name=name, count=share * settings.independent)
+    problem = AppearanceProblem.of(capture, settings)
     records, best, schedule = [], None, settings.light_schedule
-    trusts, first, last_fitted = settings.specular, 0, np.inf
+    highlights_count, first, last_fitted = settings.specular, 0, np.inf
+    state = FitState(problem.uniform_start(), problem.errors)
     if start is not None:
-        solver.start_from(start.state)
-        trusts, first = trusts and start.trusted, len(schedule) - 1
+        state = replace(state, appearance=problem.start_from(start.state))
+        highlights_count, first = highlights_count and start.highlights_count, len(schedule) - 1
         last_fitted = start.fitted if keep_start else np.inf
     for stage, (model, resolution) in list(enumerate(schedule))[first:]:
-        solver.set_light((model, resolution))
+        shares = state.errors.light_shares
+        state = replace(state, appearance=problem.with_light_model(state.appearance, model, resolution, shares))
         last, shaping_steps = np.inf, _SHAPING_STEPS if start is None and stage == 0 else 1
         worthwhile = _WORTHWHILE if stage == len(schedule) - 1 else _WORTHWHILE_COARSE
-        anew = shapes or start is None if stage == first else trusts and model != schedule[stage - 1][0]
-        shaping = anew and settings.steps > 1
-        enough = 2 if shaping else least
+        anew = shapes or start is None if stage == first else highlights_count and model != schedule[stage - 1][0]
+        phase = Phase.SHAPING if anew and settings.steps > 1 else Phase.SOLVING
+        enough = 2 if phase is Phase.SHAPING else least
         kept = None
         for number in range(settings.steps):
-            moves = number > 0 or not keep_start
-            record, rise, by_frame = _step(solver, settings, trusts and not shaping, moves)
-            record |= {"light": model, "resolution": resolution, "step": number, "shaping": shaping}
-            if kept is not None and rise > _LARGEST_RISE:
-                solver.state, solver.lobes, trusts = kept[1], None, False
+            counts = highlights_count and phase is Phase.SOLVING
+            state, found = step(problem, state, counts, light_moves=number > 0 or not keep_start)
+            record = found.record(model, resolution, number, phase)
+            if kept is not None and found.rise > _LARGEST_RISE:
+                state, highlights_count = replace(state, appearance=kept[0]), False
                 records.append(record | {"undone": True})
                 report(records[-1])
                 if best is None and model == settings.light_model:
-                    best = (judge(kept[0]), kept[0], _copy(solver.state), kept[2])
+                    best = (kept[1].judged(capture, settings.independent), kept[1], kept[0])
                 break
-            kept = record, _copy(solver.state), by_frame
+            kept = state.appearance, found
             records.append(record)
             report(record)
-            judged = judge(record)
-            if not shaping and model == settings.light_model:
+            judged = found.judged(capture, settings.independent)
+            if phase is Phase.SOLVING and model == settings.light_model:
                 lowest = judged if best is None else min(judged, best[0])
                 if best is None or judged <= lowest * (1.0 + _WORTHWHILE):
-                    best = (lowest, record, _copy(solver.state), by_frame)
-            if shaping:
-                change = abs(record["fitted"] / last_fitted - 1.0)
+                    best = (lowest, found, state.appearance)
+            if phase is Phase.SHAPING:
+                change = abs(found.fitted / last_fitted - 1.0)
                 if number + 1 >= shaping_steps and change < _SHAPED or number + 2 >= settings.steps:
-                    shaping, enough = False, number + 1 + enough
+                    phase, enough = Phase.SOLVING, number + 1 + enough
             elif number >= enough and judged > last * (1.0 - worthwhile):
-                if not trusts or record["rescaled"] < _CONVERGED_SCALE:
+                if not highlights_count or found.rescaled < _CONVERGED_SCALE:
                     break
-            last, last_fitted = judged, record["fitted"]
-    _, record, state, by_frame = best
+            last, last_fitted = judged, found.fitted
+    _, found, appearance = best
     return Solution(
-        state, tuple(records), fitted=record["fitted"], held_out=record["held_out"], trusted=trusts,
-        frame_errors=by_frame,
-        light_weights=tuple(record.get("light_trust", ())),
+        appearance, tuple(records), fitted=found.fitted, held_out=found.held_out, highlights_count=highlights_count,
+        frame_errors=found.frame_errors, light_weights=found.light_weights,
     )
 
 
-def _judged(record: dict, name: str, count: float) -> float:
-    """The residual of a step, raised by what the prior on skin says against its albedo.
-
-    A residual r of count independent samples and a prior's cost p together are as likely as a residual of
-    r sqrt(1 + 2 p / count) alone: no frame shows what samples leave open.
-    """
-    return record[name] * (1.0 + 2.0 * record["skin_prior"] / count) ** 0.5
-
-
-def with_local_roughness(solver: AppearanceSolver, solution: Solution) -> Solution:
-    """The solution that the solver, baked, stands at, with roughness that varies over the skin where that serves."""
-    if not (solver.settings.specular and solver.settings.local_roughness):
-        return solution
-    local_roughness_fit, said = local_roughness(solver)
-    return replace(solution, local_roughness_fit=local_roughness_fit, roughness_record=said)
-
-
-def _step(
-    solver: AppearanceSolver, settings: AppearanceSettings, trusts: bool, moves: bool = True
-) -> tuple[dict, float, np.ndarray]:
-    """One step of everything -> its record, by what factor the robust loss rose, and the error of each frame [F];
-    trusts: highlights say something about the scale and their own strength; moves: the light changes, and not only its
-    scale."""
-    solver.trust_highlights = trusts
-    solver.bake()
-    if settings.specular and solver.lobes is None:
-        solver.bake_lobes()
-    step = _linearised(solver)
-    before, spread = solver.loss(step.radiance)
-    if moves:
-        step.update()
-    rescaled = step.resolve_scale()
-    state = solver.state
-    state.node_albedo = state.albedo[solver.node_to_point]
-    model = solver.model(step.irradiance, step.reflection)
-    rise = solver.loss(model, spread)[0] / before
-    solver.measure_reduced_chi_square(model, step.weight)
-    fitted, held_out = solver.residuals(model)
-    several = {}
-    if len(solver.light_frames) > 1:
-        several = {"light_trust": weigh_samples(solver, step.irradiance, model)}
-    return several | {
-        "fitted": fitted,
-        "held_out": held_out,
-        "cost": step.before,
-        "rescaled": rescaled,
-        "skin_prior": step.unlikely_skin(step.albedo),
-        "specular_intensity": state.specular,
-        "roughness": state.roughness,
-    }, rise, solver.frame_errors(model)
+def step(
+    problem: AppearanceProblem, state: FitState, highlights_count: bool, light_moves: bool = True
+) -> tuple[FitState, StepReport]:
+    """One step of everything. highlights_count: they say something about the scale and their own strength; light_moves:
+    the light changes, and not only its scale."""
+    errors = state.errors
+    linear = _linearised(problem, state, highlights_count)
+    before, spread = errors.loss(linear.radiance)
+    params, cost = linear.improved_light() if light_moves else (linear.state.params, 0.0)
+    resolved = linear.resolved_scale(params)
+    appearance = replace(resolved.state, node_albedo=resolved.state.albedo[problem.node_to_point])
+    model = appearance.radiance(resolved.irradiance, resolved.reflection)
+    rise = errors.loss(model, spread)[0] / before
+    errors = errors.with_reduced_chi_square(model, linear.weight)
+    fitted, held_out = errors.residuals(model)
+    light_weights = ()
+    if len(errors.light_frames) > 1:
+        along = torch.from_numpy(resolved.transport.frame_light.along(appearance.light))
+        errors, light_weights = weigh_samples(problem.capture, appearance, errors, along, resolved.irradiance, model)
+        appearance = replace(appearance, light_model=appearance.light_model.with_shares(errors.light_shares))
+    found = StepReport(
+        fitted=fitted,
+        held_out=held_out,
+        cost=cost,
+        rescaled=resolved.rescaled,
+        skin_prior=linear.unlikely_skin(resolved.albedo),
+        specular_intensity=appearance.specular,
+        roughness=appearance.roughness,
+        light_weights=light_weights,
+        rise=rise,
+        frame_errors=errors.frame_errors(model),
+    )
+    return FitState(appearance, errors), found
 
 
-def _linearised(solver: AppearanceSolver) -> LightStep:
+def _linearised(problem: AppearanceProblem, state: FitState, highlights_count: bool) -> LinearisedFit:
     """The linearised problem, where highlights count at about the roughness that they have in the present light: until
     then they would lead the scale astray."""
-    step = LightStep(solver)
+    transport = problem.transport(state.appearance)
+    linear = LinearisedFit.at(problem, state.appearance, transport, state.errors, highlights_count)
     for _ in range(_ROUGHNESS_STEPS):
-        if step.specular_fit is None or abs(step.specular_fit.change_of_roughness) < LARGEST_ROUGHNESS_STEP:
+        if linear.specular_fit is None or abs(linear.specular_fit.change_of_roughness) < LARGEST_ROUGHNESS_STEP:
             break
-        roughness_step = solver.update_roughness(step.specular_fit.change_of_roughness)
-        step = LightStep(solver)
-        if roughness_step < LARGEST_ROUGHNESS_STEP:  # as far as its range goes
+        before, change = linear.state, linear.specular_fit.change_of_roughness
+        after = replace(before, roughness=changed_roughness(before.roughness, change))
+        transport = replace(transport, lobes=None)
+        del linear  # and with it the tables of the roughness before
+        transport = replace(transport, lobes=problem.lobes_at(after.roughness))
+        linear = LinearisedFit.at(problem, after, transport, state.errors, highlights_count)
+        if abs(np.log(after.roughness / before.roughness)) < LARGEST_ROUGHNESS_STEP:  # as far as its range goes
             break
-    return step
-
-
-def _copy(state: AppearanceState) -> AppearanceState:
-    return replace(state, params=state.params.copy(), albedo=state.albedo.copy())
+    return linear

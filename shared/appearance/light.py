@@ -39,7 +39,7 @@ class FrameLight:
         world_from_head: np.ndarray,
         light_index: np.ndarray | None = None,
     ):
-        self.shape = (len(directions), len(world_from_head))
+        self.resolution, self.shape = resolution, (len(directions), len(world_from_head))
         self._lookup = frame_lookup(directions, world_from_head, resolution, light_index).astype(np.float32)
         self._transposed = self._lookup.T.tocsr()
 

@@ -178,12 +178,13 @@ class LampLight:
 class SeveralLights:
     """Lights of one model, each by itself: their parameters, and their cubemaps, one below the other.
 
-    All raise together: what they are to each other is for the samples to say. shares [L]: weight of each one's prior.
+    All raise together: what they are to each other is for the samples to say. shares [L]: weight of each one's prior,
+    empty: 1.
     """
 
-    def __init__(self, model: LogLight | LampLight, count: int):
+    def __init__(self, model: LogLight | LampLight, count: int, shares: Sequence[float] = ()):
         self.model, self.count, self.resolution = model, count, model.resolution
-        self.shares = [1.0] * count
+        self.shares = tuple(shares) or (1.0,) * count
         self.unit = np.tile(model.unit, (count, 1))
         own = np.arange(len(model.unit))
         moving = own[model.moving_rows]
@@ -222,6 +223,10 @@ class SeveralLights:
         cost = sum(share * own for share, own in zip(self.shares, costs, strict=True))
         return cost, self._weighted(gradients), product
 
+    def with_shares(self, shares: Sequence[float]) -> SeveralLights:
+        """The same with other weights [L] of their priors."""
+        return SeveralLights(self.model, self.count, shares)
+
     def _weighted(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         return np.concatenate([share * part for share, part in zip(self.shares, parts, strict=True)])
 
@@ -233,10 +238,11 @@ class SeveralLights:
 LightModel = LogLight | LampLight | SeveralLights
 
 
-def make_light_model(name: str, resolution: int, lights: int = 1) -> LightModel:
-    """The model of that name (the module's table) on a cubemap of a resolution, for one light or several."""
+def make_light_model(name: str, resolution: int, lights: int = 1, shares: Sequence[float] = ()) -> LightModel:
+    """The model of that name (the module's table) on a cubemap of a resolution, for one light or several; shares: see
+    SeveralLights."""
     if lights > 1:
-        return SeveralLights(make_light_model(name, resolution), lights)
+        return SeveralLights(make_light_model(name, resolution), lights, shares)
     directions = cube_directions(resolution)
     if name == "cubemap":
         return LogLight(resolution)

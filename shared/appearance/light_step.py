@@ -1,4 +1,4 @@
-"""One Gauss-Newton step of the light's parameters with the albedo projected out, and the loop around it.
+"""One Gauss-Newton step of the light's parameters with albedo and specular terms projected out, and the scale after it.
 
 The step solves (J^T W J + priors) d = -gradient by conjugate gradients. J is never formed: its product with a change
 of light renders that change for all points and frames and removes what a change of albedo, and once highlights count
@@ -12,15 +12,25 @@ References: [Golub1973] and [Kaufman1975] (variable projection).
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from shared.appearance.albedo_scale import resolve_scale
-from shared.appearance.products import per_channel, per_channel_transposed, reflect, reflect_transposed
+from shared.appearance.problem import AppearanceProblem, AppearanceState
+from shared.appearance.projection import (
+    ALBEDO_PULL,
+    LARGEST_ROUGHNESS_STEP,
+    SpecularFit,
+    best_albedo,
+    changed_roughness,
+    measure_highlights,
+    project_off_albedo,
+)
+from shared.appearance.sample_errors import SampleErrors
 from shared.appearance.skin_prior import SkinPull
-from shared.appearance.solver import ALBEDO_PULL, LARGEST_ROUGHNESS_STEP, AppearanceSolver
-from shared.appearance.specular_fit import SpecularFit
+from shared.appearance.transport import LobeSlopes, Transport
 
 _LARGEST_RISE, _LARGEST_FALL = 1.5, 4.0
 """Bounds on a step of the log light, each texel by itself: the linearisation of exp holds for a rise of this size; a
@@ -35,9 +45,9 @@ are what the samples tell least of, and come last: steps that stop before leave 
 
 
 def conjugate_gradients(
-    product: Callable, right: np.ndarray, count: int, tolerance: float = 0.02
+    product: Callable[[np.ndarray], np.ndarray], right: np.ndarray, count: int, tolerance: float = 0.02
 ) -> np.ndarray:
-    """Approximate solution of product(x) = right by conjugate gradients, at most count products.
+    """Approximate solution, of right's shape, of product(x) = right by conjugate gradients, at most count products.
 
     Ends when the residual has fallen by the tolerance. Ended long before, what remains hangs on roundings: 1e-7 in
     products of single precision comes out as 1e-2.
@@ -60,112 +70,112 @@ def conjugate_gradients(
     return x
 
 
-class LightStep:
-    """The linearised problem at the solver's present state."""
+@dataclass(frozen=True, eq=False)
+class LinearisedFit:
+    """The problem at a state, whose albedo is the best under its light, and what does not change while the light does.
 
-    def __init__(self, solver: AppearanceSolver):
-        self.solver = solver
-        self.model = solver.state.light_model
-        self.light = solver.state.light
-        self.seeks_roughness = solver.trust_highlights and solver.settings.fit_roughness
-        if self.seeks_roughness and solver.slopes is None:
-            solver.bake_slopes()
-        self.irradiance, self.reflection = solver.forward(self.light)
-        self.weight = solver.weights(solver.model(self.irradiance, self.reflection)) * solver.fitted
-        self.evidence = solver.evidence(self.weight)
-        self.before = 0.0
-        self.specular_fit = self._fit_specular(self.light, self.irradiance, self.reflection)
-        self.highlights = self._highlights(self.specular_fit, self.reflection)
-        self._fit_points(self.highlights)
-        self.skin = self._skin_pull()
+    transport, errors: the state's; highlights_count: whether highlights say something about the light and the scale;
+    slopes: of the lobes, None where the roughness is not sought; irradiance, reflection [3, P, F]: the forward model;
+    weight [3, P, F]: of the fitted samples; evidence: see SampleErrors; specular_fit: what intensity and roughness
+    highlights have, None while they don't count; highlights [3, P, F]; albedo [3, P, 1]; skin: the prior on skin near
+    that albedo, or None, and albedo_slope [3, P, F]: derivative of the log albedo by the samples; prior_gradient
+    [M, 3] and prior_product: of the light's regularisers.
+    """
 
-    def _fit_specular(self, light: np.ndarray, irradiance: torch.Tensor,
-                      reflection: torch.Tensor) -> SpecularFit | None:
-        """Intensity and roughness for a light, once highlights count."""
-        if not self.solver.trust_highlights:
-            return None
-        slope = self.solver.forward_slope(light, irradiance) if self.seeks_roughness else None
-        return SpecularFit(self.solver, irradiance, reflection, slope, self.weight, self.evidence)
+    problem: AppearanceProblem
+    state: AppearanceState
+    transport: Transport
+    errors: SampleErrors
+    highlights_count: bool
+    slopes: LobeSlopes | None
+    irradiance: torch.Tensor
+    reflection: torch.Tensor
+    weight: torch.Tensor
+    evidence: float
+    specular_fit: SpecularFit | None
+    highlights: torch.Tensor
+    albedo: torch.Tensor
+    skin: SkinPull | None
+    albedo_slope: torch.Tensor | None
+    prior_gradient: np.ndarray
+    prior_product: Callable[[np.ndarray], np.ndarray]
 
-    def _highlights(self, specular_fit: SpecularFit | None, reflection: torch.Tensor) -> torch.Tensor:
-        return self.solver.state.specular * reflection if specular_fit is None else specular_fit.highlights
-
-    def _fit_points(self, highlights: torch.Tensor) -> None:
-        solver = self.solver
-        self.albedo = solver.best_albedo(self.irradiance, highlights, self.weight)
-        solver.state.albedo = self.albedo[..., 0].T.double().numpy()
+    @classmethod
+    def at(
+        cls, problem: AppearanceProblem, state: AppearanceState, transport: Transport, errors: SampleErrors,
+        highlights_count: bool,
+    ) -> LinearisedFit:
+        """Of a state; the arguments are those of the class."""
+        settings, light = problem.settings, state.light
+        slopes = transport.lobes.slopes() if highlights_count and settings.fit_roughness else None
+        irradiance, reflection = transport.forward(light)
+        weight = errors.weights(state.radiance(irradiance, reflection)) * errors.fitted
+        evidence = errors.evidence(weight)
+        specular_fit, highlights = None, state.specular * reflection
+        if highlights_count:
+            slope = None if slopes is None else transport.roughness_slope(slopes, light, irradiance)
+            specular_fit = SpecularFit(settings, state, errors, irradiance, reflection, slope, weight, evidence)
+            highlights = specular_fit.highlights
+        albedo = best_albedo(errors, irradiance, highlights, weight, problem.typical_albedo(state))
+        skin, albedo_slope = None, None
+        if problem.skin_prior is not None:
+            curvature = (weight * irradiance.square()).sum(2)
+            albedo_slope = weight * irradiance / (curvature + ALBEDO_PULL)[..., None] / albedo
+            known = (curvature / (curvature + ALBEDO_PULL)).min(0).values
+            skin = problem.skin_prior.at(_log_of(albedo), known.double().numpy())
+        _, prior_gradient, prior_product = state.light_model.prior(state.params, settings.priors)
+        return cls(
+            problem=problem,
+            state=_with_albedo(state, albedo),
+            transport=transport,
+            errors=errors,
+            highlights_count=highlights_count,
+            slopes=slopes,
+            irradiance=irradiance,
+            reflection=reflection,
+            weight=weight,
+            evidence=evidence,
+            specular_fit=specular_fit,
+            highlights=highlights,
+            albedo=albedo,
+            skin=skin,
+            albedo_slope=albedo_slope,
+            prior_gradient=prior_gradient,
+            prior_product=prior_product,
+        )
 
     @property
     def radiance(self) -> torch.Tensor:
         """The model [3, P, F] that is linearised, all that is projected out at its best."""
         return self.albedo * self.irradiance + self.highlights
 
-    def _skin_pull(self) -> SkinPull | None:
-        """The prior on skin near the present albedo; points count as far as the samples determine them."""
-        if self.solver.skin_prior is None:
+    def fit_specular(
+        self, light: np.ndarray, irradiance: torch.Tensor, reflection: torch.Tensor
+    ) -> SpecularFit | None:
+        """Intensity and roughness, once highlights count, for another light [6 n^2, 3], which gives irradiance and
+        reflection [3, P, F]."""
+        if not self.highlights_count:
             return None
-        curvature = (self.weight * self.irradiance.square()).sum(2)
-        self.per_albedo = self.weight * self.irradiance / (curvature + ALBEDO_PULL)[..., None] / self.albedo
-        known = (curvature / (curvature + ALBEDO_PULL)).min(0).values
-        return self.solver.skin_prior.at(_log_of(self.albedo), known.double().numpy())
-
-    def resolve_scale(self) -> float:
-        """Roughness, specular intensity, the light's scale and the albedo for the present light, weights as they were
-        -> by how much the scale changed at most, in the logarithm; while the roughness moves the scale waits, and the
-        roughness's change is returned."""
-        solver, settings = self.solver, self.solver.settings
-        self.irradiance, self.reflection = solver.forward(solver.state.light)
-        roughness_step = self._update_roughness()
-        if roughness_step > _CONVERGED:
-            specular_fit = SpecularFit(solver, self.irradiance, self.reflection, None, self.weight, self.evidence)
-            solver.state.specular = max(float(specular_fit.best[0]), 0.0)
-            self._fit_points(specular_fit.highlights)
-            return roughness_step
-        self._fit_points(solver.state.specular * self.reflection)
-        log_albedo, log_irradiance, _ = solver.mean_on_skin(self.albedo, self.irradiance)
-        highlights = None
-        if solver.trust_highlights:
-            highlights = solver.highlights(self.irradiance, self.reflection, self.weight)
-        relative = solver.relative_light(self.irradiance)
-        chart = solver.capture.chart
-        if chart is not None:
-            light = np.split(solver.state.light, len(relative))[chart.light]
-            chart = chart.log_factor(light, np.exp(log_albedo + log_irradiance + relative[chart.light]))
-        log_factor, specular = resolve_scale(
-            log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart, relative
-        )
-        factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]
-        solver.state.params = self.model.scaled(solver.state.params, log_factor)
-        solver.state.specular = specular if settings.specular else 0.0
-        self.irradiance, self.reflection = self.irradiance * factor, self.reflection * factor
-        solver.state.albedo = solver.state.albedo * np.exp(-log_factor)  # what points of few samples are pulled to
-        self._fit_points(solver.state.specular * self.reflection)
-        return float(np.abs(log_factor).max())
-
-    def _update_roughness(self) -> float:
-        """Moves the roughness, where it is sought, to where highlights in the present light have it -> by how much."""
-        solver = self.solver
-        if not self.seeks_roughness:
-            return 0.0
-        change = self._fit_specular(solver.state.light, self.irradiance, self.reflection).change_of_roughness
-        roughness_step = solver.update_roughness(change)
-        self.irradiance, self.reflection = solver.forward(solver.state.light)
-        return roughness_step
+        slope = None if self.slopes is None else self.transport.roughness_slope(self.slopes, light, irradiance)
+        return SpecularFit(self.problem.settings, self.state, self.errors, irradiance, reflection, slope, self.weight,
+                           self.evidence)
 
     def cost(self, params: np.ndarray) -> float:
-        """Data and priors with albedo and, once highlights count, specular terms projected out; weights held."""
-        return self._judge(params)[0]
+        """Data and priors of a light of parameters [M, 3], albedo and, once highlights count, specular terms projected
+        out; weights held."""
+        return self.judge(params)[0]
 
-    def _judge(self, params: np.ndarray) -> tuple[float, float]:
-        """That, and the change of the log roughness with which it is reached."""
-        solver, light = self.solver, self.model.radiance(params)
-        irradiance, reflection = solver.forward(light)
-        specular_fit = self._fit_specular(light, irradiance, reflection)
-        highlights = self._highlights(specular_fit, reflection)
-        albedo = solver.best_albedo(irradiance, highlights, self.weight)
-        error = albedo * irradiance + highlights - solver.colours
+    def judge(self, params: np.ndarray) -> tuple[float, float]:
+        """The cost of parameters [M, 3], and the change of the log roughness with which it is reached."""
+        state, light = self.state, self.state.light_model.radiance(params)
+        irradiance, reflection = self.transport.forward(light)
+        specular_fit = self.fit_specular(light, irradiance, reflection)
+        highlights = state.specular * reflection if specular_fit is None else specular_fit.highlights
+        albedo = self._albedo(state, irradiance, highlights)
+        error = albedo * irradiance + highlights - self.errors.colours
         data = 0.5 * self.evidence * float((self.weight * error.square()).sum())
-        known = self.unlikely_skin(albedo) + self.model.prior(params, solver.settings.priors)[0]
+        prior = state.light_model.prior(params, self.problem.settings.priors)[0]
+        known = self.unlikely_skin(albedo) + prior
         return (data + known, 0.0) if specular_fit is None else (data + known + specular_fit.unlikely,
                                                                  specular_fit.change_of_roughness)
 
@@ -173,65 +183,55 @@ class LightStep:
         """What the prior on skin costs for an albedo [3, P, 1]."""
         return 0.0 if self.skin is None else self.skin.cost(_log_of(albedo))
 
-    def _render(self, change: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-        """Change of the model [3, P, F] with the parameters [M, 3], and of it what is out of the eliminated unknowns'
-        reach."""
-        solver = self.solver
-        along = torch.from_numpy(solver.frame_light.along(self.model.tangent(solver.state.params, change)))
-        result = self.albedo * per_channel(solver.baked, along.permute(2, 0, 1))
-        if solver.settings.specular:
-            result += solver.state.specular * reflect(solver.lobes, along)
-        pure = solver.project_off_albedo(result, self.irradiance, self.weight)
-        return result, pure if self.specular_fit is None else self.specular_fit.off(pure)
+    def gradient(self) -> np.ndarray:
+        """[M, 3] derivative of cost by the parameters."""
+        values = self.evidence * self.weight * (self.radiance - self.errors.colours)
+        if self.skin is not None:
+            values = values + self._pull_of_skin(_log_of(self.albedo))
+        specular, slope = self.state.specular, 0.0
+        if self.specular_fit is not None:
+            slope = specular * self.specular_fit.change_of_roughness
+            specular = float(self.specular_fit.best[0])
+        if slope:
+            light = self.transport.render_adjoint_with_slopes(values, self.albedo, specular, self.slopes, slope)
+        else:
+            light = self.transport.render_adjoint(values, self.albedo, specular)
+        return self.state.light_model.adjoint(self.state.params, light) + self.prior_gradient
+
+    def product(self, change: np.ndarray) -> np.ndarray:
+        """Gauss-Newton Hessian times a change [M, 3]."""
+        state = self.state
+        light = state.light_model.tangent(state.params, change)
+        whole = self.transport.render(light, self.albedo, state.specular)
+        pure = project_off_albedo(whole, self.irradiance, self.weight)
+        if self.specular_fit is not None:
+            pure = self.specular_fit.project_off(pure)
+        values = self.evidence * self.weight * pure
+        if self.skin is not None:
+            fall = -(self.albedo_slope * whole).sum(2)
+            values = values + self._pull_of_skin(fall.double().numpy())
+        light = self.transport.render_adjoint(values, self.albedo, state.specular)
+        return state.light_model.adjoint(state.params, light) + self.prior_product(change)
 
     def _pull_of_skin(self, log_albedo: np.ndarray) -> torch.Tensor:
         """Derivative [3, P, F] of the prior on skin at log_albedo [3, P] by the model, whose rise the albedo that is
         fitted to it turns into a fall of its own."""
-        return self.per_albedo * torch.from_numpy(-self.skin(log_albedo)).float()[..., None]
+        return self.albedo_slope * torch.from_numpy(-self.skin(log_albedo)).float()[..., None]
 
-    def _adjoint(self, values: torch.Tensor, specular: float, slope: float = 0.0) -> np.ndarray:
-        """Transpose of the unprojected rendering, with highlights specular S + slope S': [3, P, F] -> [M, 3]."""
-        solver = self.solver
-        along = per_channel_transposed(solver.baked, self.albedo * values).permute(1, 2, 0)
-        if solver.settings.specular:
-            along = along + specular * reflect_transposed(solver.lobes, values)
-        if slope:
-            along = along + slope * reflect_transposed(solver.slopes, values)
-        return self.model.adjoint(solver.state.params, solver.frame_light.adjoint(along.contiguous().numpy()))
-
-    def gradient(self) -> np.ndarray:
-        """[M, 3] derivative of cost by the parameters."""
-        solver, state = self.solver, self.solver.state
-        values = self.evidence * self.weight * (self.radiance - solver.colours)
-        if self.skin is not None:
-            values = values + self._pull_of_skin(_log_of(self.albedo))
-        specular_fit = (state.specular,) if self.specular_fit is None else (
-            float(self.specular_fit.best[0]), state.specular * self.specular_fit.change_of_roughness)
-        _, prior, self.prior_product = self.model.prior(state.params, solver.settings.priors)
-        return self._adjoint(values, *specular_fit) + prior
-
-    def product(self, change: np.ndarray) -> np.ndarray:
-        """Gauss-Newton Hessian times a change [M, 3]."""
-        whole, pure = self._render(change)
-        values = self.evidence * self.weight * pure
-        if self.skin is not None:
-            fall = -(self.per_albedo * whole).sum(2)
-            values = values + self._pull_of_skin(fall.double().numpy())
-        return self._adjoint(values, self.solver.state.specular) + self.prior_product(change)
-
-    def update(self) -> None:
-        """Moves the solver's light at constant mean irradiance per channel; halved until the cost falls.
+    def improved_light(self) -> tuple[np.ndarray, float]:
+        """Parameters [M, 3] of a light of the same mean irradiance per channel after a step, halved until the cost
+        falls, and the cost before it.
 
         Within the bounds by cutting off what single texels want too much, or by a shorter step as a whole, whichever
         costs less: the one lets a lamp form, the other keeps the direction where many small wishes make up one pattern.
 
-        The scale is left to resolve_scale: steps x are taken as Q x with Q = 1 - u g', where u raises the log light by
+        The scale is left to resolved_scale: steps x are taken as Q x with Q = 1 - u g', where u raises the log light by
         one and g is the derivative of the log mean irradiance (g' u = 1), so that g' Q x = 0.
         """
-        state = self.solver.state
-        gauge = self.model.adjoint(state.params, self.solver.mean_on_skin(self.albedo, self.irradiance)[2])
-        gauge[self.model.moving_rows] = 0.0
-        unit = self.model.unit
+        params, model = self.state.params, self.state.light_model
+        gauge = model.adjoint(params, self.problem.mean_on_skin(self.albedo, self.irradiance, self.transport)[2])
+        gauge[model.moving_rows] = 0.0
+        unit = model.unit
 
         def level(change: np.ndarray) -> np.ndarray:
             return change - unit * (gauge * change).sum(0)
@@ -239,27 +239,92 @@ class LightStep:
         def level_transposed(change: np.ndarray) -> np.ndarray:
             return change - gauge * (unit * change).sum(0)
 
-        right = -level_transposed(self.gradient())
-        several = len(self.solver.light_frames) > 1
-        count, tolerance = PRECISION_OF_SEVERAL if several else self.solver.settings.precision
-        solved = conjugate_gradients(
-            lambda x: level_transposed(self.product(level(x))), right, count, tolerance
-        )
-        whole = level(solved)
+        several = len(self.errors.light_frames) > 1
+        count, tolerance = PRECISION_OF_SEVERAL if several else self.problem.settings.precision
+        whole = level(conjugate_gradients(
+            lambda x: level_transposed(self.product(level(x))), -level_transposed(self.gradient()), count, tolerance
+        ))
         longest = max(whole.max() / _LARGEST_RISE, -whole.min() / _LARGEST_FALL, 1.0)
         steps = [whole]
         if longest > 1.0:
             steps = [level(np.clip(whole, -_LARGEST_FALL, _LARGEST_RISE)), whole / longest]
-        self.before = self.cost(state.params)
+        before = self.cost(params)
         for halving in 0.5 ** np.arange(6):
-            costs, changes = zip(*(self._judge(state.params + halving * step) for step in steps), strict=True)
+            costs, changes = zip(*(self.judge(params + halving * step) for step in steps), strict=True)
             best = int(np.argmin(costs))
-            if costs[best] < self.before:
+            if costs[best] < before:
                 shorter = min(1.0, LARGEST_ROUGHNESS_STEP / max(abs(changes[best]), 1e-9))
-                state.params = state.params + shorter * halving * steps[best]
-                break
+                return params + shorter * halving * steps[best], before
+        return params, before
+
+    def resolved_scale(self, params: np.ndarray) -> ResolvedFit:
+        """Roughness, specular intensity, the light's scale and the albedo for a light of parameters [M, 3], weights as
+        they were. While the roughness moves the scale waits."""
+        problem, settings = self.problem, self.problem.settings
+        state, transport = replace(self.state, params=params), self.transport
+        irradiance, reflection = transport.forward(state.light)
+        changed = 0.0
+        if self.slopes is not None:
+            change = self.fit_specular(state.light, irradiance, reflection).change_of_roughness
+            before, state = state.roughness, replace(state, roughness=changed_roughness(state.roughness, change))
+            changed = abs(float(np.log(state.roughness / before)))
+            transport = replace(transport, lobes=problem.lobes_at(state.roughness))
+            irradiance, reflection = transport.forward(state.light)
+        if changed > _CONVERGED:
+            specular_fit = SpecularFit(settings, state, self.errors, irradiance, reflection, None, self.weight,
+                                       self.evidence)
+            albedo = self._albedo(state, irradiance, specular_fit.highlights)
+            state = replace(_with_albedo(state, albedo), specular=max(float(specular_fit.best[0]), 0.0))
+            return ResolvedFit(state, transport, irradiance, reflection, albedo, changed)
+        albedo = self._albedo(state, irradiance, state.specular * reflection)
+        log_albedo, log_irradiance, _ = problem.mean_on_skin(albedo, irradiance, transport)
+        highlights = None
+        if self.highlights_count:
+            highlights = measure_highlights(self.errors, irradiance, reflection, self.weight)
+        relative = problem.relative_light(irradiance)
+        chart = problem.capture.chart
+        if chart is not None:
+            light = np.split(state.light, len(relative))[chart.light]
+            chart = chart.log_factor(light, np.exp(log_albedo + log_irradiance + relative[chart.light]))
+        log_factor, specular = resolve_scale(
+            log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart, relative
+        )
+        factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]
+        irradiance, reflection = irradiance * factor, reflection * factor
+        state = replace(
+            _with_albedo(state, albedo),
+            params=state.light_model.scaled(state.params, log_factor),
+            specular=specular if settings.specular else 0.0,
+        )
+        # What points of few samples are pulled to has the new scale, too.
+        state = replace(state, albedo=state.albedo * np.exp(-log_factor))
+        albedo = self._albedo(state, irradiance, state.specular * reflection)
+        changed = float(np.abs(log_factor).max())
+        return ResolvedFit(_with_albedo(state, albedo), transport, irradiance, reflection, albedo, changed)
+
+    def _albedo(self, state: AppearanceState, irradiance: torch.Tensor, highlights: torch.Tensor) -> torch.Tensor:
+        typical = self.problem.typical_albedo(state)
+        return best_albedo(self.errors, irradiance, highlights, self.weight, typical)
+
+
+@dataclass(frozen=True, eq=False)
+class ResolvedFit:
+    """A state whose scale is resolved, its transport, irradiance and reflection [3, P, F] and albedo [3, P, 1];
+    rescaled: by how much the scale changed at most, in the logarithm, or the roughness while it moves."""
+
+    state: AppearanceState
+    transport: Transport
+    irradiance: torch.Tensor
+    reflection: torch.Tensor
+    albedo: torch.Tensor
+    rescaled: float
+
+
+def _with_albedo(state: AppearanceState, albedo: torch.Tensor) -> AppearanceState:
+    """The state with an albedo [3, P, 1]."""
+    return replace(state, albedo=albedo[..., 0].T.double().numpy())
 
 
 def _log_of(albedo: torch.Tensor) -> np.ndarray:
-    """[3, P, 1] -> its logarithm [3, P]."""
+    """albedo [3, P, 1] -> its logarithm [3, P]."""
     return torch.log(albedo[..., 0]).double().numpy()

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from shared.appearance.observations import Capture
-from shared.appearance.solver import AppearanceSolver
+from shared.appearance.problem import AppearanceState
+from shared.appearance.sample_errors import SampleErrors
 from shared.appearance.texture import CORRELATED_FRAMES, IRRADIANCE_ERROR, NORMAL_ERROR
 from shared.rendering.irradiance_errors import SHADOW_MM, irradiance_slope, shadow_uncertainty
 
@@ -21,25 +22,31 @@ LEAST_WEIGHT = 0.01
 """Of a sample, against those of the light that knows its point best."""
 
 
-def weigh_samples(solver: AppearanceSolver, irradiance: torch.Tensor, model: torch.Tensor) -> list[float]:
-    """Weighs the solver's samples under its present state; irradiance, model [3, P, F] -> weight of each light, 1 in
-    the one that the model follows best."""
-    error, inactive = solver.errors(model)
-    error = error / solver.reliability
-    spread = [solver.spread(error, inactive, own) for own in solver.light_frames]
-    weights = [max(min(spread) / value, LEAST_WEIGHT) for value in spread]
-    along = torch.from_numpy(solver.frame_light.along(solver.state.light))
-    albedo = torch.from_numpy(np.ascontiguousarray(solver.state.albedo.T, np.float32))
-    plain = solver.precision / solver.reliability
-    uncertainty = _shadow_uncertainty(solver.capture, along)
+def weigh_samples(
+    capture: Capture,
+    state: AppearanceState,
+    errors: SampleErrors,
+    light_along: torch.Tensor,
+    irradiance: torch.Tensor,
+    model: torch.Tensor,
+) -> tuple[SampleErrors, tuple[float, ...]]:
+    """The samples' errors, weighed under a state: light_along [J, F, 3], irradiance and model [3, P, F] are its own.
+    And the weight of each light, 1 of the one that the model follows best."""
+    error, inactive = errors.errors(model)
+    error = error / errors.reliability
+    spread = [errors.spread(error, inactive, own) for own in errors.light_frames]
+    weights = tuple(max(min(spread) / value, LEAST_WEIGHT) for value in spread)
+    albedo = torch.from_numpy(np.ascontiguousarray(state.albedo.T, np.float32))
+    plain = errors.precision / errors.reliability
+    uncertainty = _shadow_uncertainty(capture, light_along)
     steady = 1.0 / (1.0 + plain * (albedo[..., None] * uncertainty).square())
-    base = solver.trust * plain * steady * ~inactive
+    base = errors.view_weight * plain * steady * ~inactive
     shares = []
-    for own, follows in zip(solver.light_frames, weights, strict=True):
+    for own, follows in zip(errors.light_frames, weights, strict=True):
         lit = irradiance[..., own]
         mean = lit.mean(2).clamp_min(1e-6)
-        slope = irradiance_slope(solver.capture.transfer, solver.capture.points.normals, along[:, own].mean(1).numpy(),
-                                 solver.capture.directions)
+        slope = irradiance_slope(capture.transfer, capture.points.normals, light_along[:, own].mean(1).numpy(),
+                                 capture.directions)
         turned = NORMAL_ERROR * torch.from_numpy(slope.T) / mean
         shared = (IRRADIANCE_ERROR * mean.median(1, keepdim=True).values / mean).square() + turned.square()
         power = (base[..., own] * lit.square()).sum(2)
@@ -49,10 +56,9 @@ def weigh_samples(solver: AppearanceSolver, irradiance: torch.Tensor, model: tor
     shares = torch.stack(shares)
     shares = (shares / shares.max(0).values).clamp_min(LEAST_WEIGHT)
     by_frame = torch.empty_like(irradiance)
-    for own, share in zip(solver.light_frames, shares, strict=True):
+    for own, share in zip(errors.light_frames, shares, strict=True):
         by_frame[..., own] = share[..., None] * steady[..., own]
-    solver.weigh(by_frame)
-    return weights
+    return errors.with_reliability(by_frame), weights
 
 
 def _shadow_uncertainty(capture: Capture, along: torch.Tensor) -> torch.Tensor:

@@ -18,7 +18,10 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from shared.appearance.solver import ROUGHNESS_RANGE, AppearanceSolver
+from shared.appearance.problem import AppearanceProblem, AppearanceState
+from shared.appearance.projection import ROUGHNESS_RANGE, best_albedo, project_off_albedo
+from shared.appearance.sample_errors import SampleErrors
+from shared.appearance.transport import Transport
 
 FACTOR, STEPS = 1.18, 2
 """Ratio of neighbouring roughnesses that are tried, and how many to each side."""
@@ -82,49 +85,57 @@ class SpecularEquations:
         return offset, np.clip(1.0 - np.square(step / SPREAD) / bend, 0.0, 1.0)
 
 
-def local_roughness(solver: AppearanceSolver) -> tuple[SpecularEquations | None, dict]:
-    """What the samples say of the roughness around each point under the state of a solver that is baked, and a record;
-    None instead where one value serves as well."""
-    state = solver.state
-    solver.bake_lobes()
-    irradiance, reflection = solver.forward(state.light)
-    model = solver.model(irradiance, reflection)
-    weight = solver.weights(model)
-    solver.measure_reduced_chi_square(model, weight)
-    equations = specular_equations_of(solver, irradiance, weight * solver.fitted)
+def local_roughness(
+    problem: AppearanceProblem, state: AppearanceState
+) -> tuple[SpecularEquations | None, dict]:
+    """What the samples say of the roughness around each point under a solved state, and a record; None instead where
+    one value serves as well."""
+    transport = problem.transport(state)
+    irradiance, reflection = transport.forward(state.light)
+    model = state.radiance(irradiance, reflection)
+    weight = problem.errors.weights(model)
+    errors = problem.errors.with_reduced_chi_square(model, weight)
+    transport = replace(transport, lobes=None)  # a table of lobes is the greatest thing in memory
+    equations = specular_equations_of(problem, state, transport, errors, irradiance, weight * errors.fitted)
     specular = torch.from_numpy(equations.specular_at(equations.positions).astype(np.float32))[None, :, None]
-    local = np.maximum(equations.roughness(equations.positions), solver.table.narrowest)
-    errors = {}
+    local = np.maximum(equations.roughness(equations.positions), problem.table.narrowest)
+    residuals = {}
     for name, tried in (("one", state.roughness), ("local", local)):
-        solver.bake_lobes(tried)
-        shown = solver.forward(state.light)[1] * specular
-        albedo = solver.best_albedo(irradiance, shown, weight)
-        held_out = weight * (1.0 - solver.fitted)
-        squared = held_out * (albedo * irradiance + shown - solver.colours).square()
-        errors[name] = float((squared.sum() / held_out.sum().clamp_min(1e-9)).sqrt())
-    solver.lobes = None
-    kept = errors["local"] < (1.0 - WORTHWHILE) * errors["one"]
+        transport = replace(transport, lobes=problem.lobes_of_each(tried))
+        shown = transport.forward(state.light)[1] * specular
+        albedo = best_albedo(errors, irradiance, shown, weight, problem.typical_albedo(state))
+        held_out = weight * (1.0 - errors.fitted)
+        squared = held_out * (albedo * irradiance + shown - errors.colours).square()
+        residuals[name] = float((squared.sum() / held_out.sum().clamp_min(1e-9)).sqrt())
+    kept = residuals["local"] < (1.0 - WORTHWHILE) * residuals["one"]
     low, high = np.percentile(local, [5, 95])
     record = {
-        "held_out": {name: round(value, 6) for name, value in errors.items()},
+        "held_out": {name: round(value, 6) for name, value in residuals.items()},
         "chosen": "local" if kept else "one",
         "found_range": [round(float(low), 4), round(float(high), 4)],
     }
     return (equations if kept else None), record
 
 
-def specular_equations_of(solver: AppearanceSolver, irradiance: torch.Tensor,
-                          weight: torch.Tensor) -> SpecularEquations:
-    """The equations under fixed light, albedo projected out; weight [3, P, F] of the samples that take part."""
-    state, (mean, spread) = solver.state, solver.settings.specular_prior
+def specular_equations_of(
+    problem: AppearanceProblem,
+    state: AppearanceState,
+    transport: Transport,
+    errors: SampleErrors,
+    irradiance: torch.Tensor,
+    weight: torch.Tensor,
+) -> SpecularEquations:
+    """The equations under a state's light, albedo projected out; transport: the state's; irradiance [3, P, F]: the
+    light's; errors, weight [3, P, F]: of the samples that take part."""
+    mean, spread = problem.settings.specular_prior
     logs = np.log(state.roughness) + np.log(FACTOR) * np.arange(-STEPS, STEPS + 1)
-    evidence, sums = solver.evidence(weight), []
+    evidence, sums = errors.evidence(weight), []
     for log in logs:
-        solver.bake_lobes(float(np.exp(log)))
-        reflection = solver.forward(state.light)[1]
-        pure = solver.project_off_albedo(reflection, irradiance, weight)
-        sums.append([(weight * pure * seen).sum((0, 2)).double().numpy() for seen in (reflection, solver.colours)])
+        transport = replace(transport, lobes=problem.lobes_at(float(np.exp(log))))
+        reflection = transport.forward(state.light)[1]
+        pure = project_off_albedo(reflection, irradiance, weight)
+        sums.append([(weight * pure * seen).sum((0, 2)).double().numpy() for seen in (reflection, errors.colours)])
     curvature, moment = evidence * np.moveaxis(np.array(sums), 1, 0)
-    positions = np.asarray(solver.capture.points.positions, np.float64)
+    positions = np.asarray(problem.capture.points.positions, np.float64)
     precision = (mean * spread) ** -2
     return SpecularEquations(positions, logs, curvature, moment, (state.specular, precision)).centred()

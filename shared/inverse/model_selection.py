@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shared.appearance.fit import Solution
-from shared.appearance.solver import Capture
+from shared.appearance.observations import Capture
 from shared.geometry.mesh import segments_at
 from shared.imaging.frame_index import hold_out, spread_frames
 from shared.imaging.image_sampling import SurfaceViewer

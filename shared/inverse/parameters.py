@@ -7,8 +7,8 @@ from pathlib import Path
 import torch
 
 from shared.appearance.light import LightPriors
+from shared.appearance.problem import AppearanceSettings
 from shared.appearance.skin_prior import SkinVariation
-from shared.appearance.solver import AppearanceSettings
 from shared.contract.job import Parameters
 from shared.contract.wording import unknown_name
 from shared.errors import InputError

@@ -9,7 +9,7 @@ import numpy as np
 
 from shared.appearance.fit import Solution
 from shared.appearance.observations import Capture, build_capture, face_front
-from shared.appearance.solver import AppearanceSettings
+from shared.appearance.problem import AppearanceSettings
 from shared.appearance.texture import TexelMaterial
 from shared.compute.read_ahead import read_ahead
 from shared.geometry.mesh import Mesh

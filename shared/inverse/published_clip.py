@@ -15,7 +15,7 @@ from shared.appearance.chart_scale import describe_scale
 from shared.appearance.fit import Solution
 from shared.appearance.light_models import LogLight
 from shared.appearance.maps import make_maps
-from shared.appearance.solver import AppearanceState
+from shared.appearance.problem import AppearanceState
 from shared.appearance.texture import TexelMaterial
 from shared.errors import InputError
 from shared.imaging.frame_index import spread_frames

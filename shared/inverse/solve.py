@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from shared.appearance.chart_scale import describe_scale, scale_warnings, state_chart
 from shared.appearance.diagnostics import diagnostic_warnings, diagnostics_of, face_regions
 from shared.appearance.fine_normals import NormalPass, resolved_texels
-from shared.appearance.fit import Solution, with_local_roughness
+from shared.appearance.fit import Solution
 from shared.appearance.light_models import SeveralLights
+from shared.appearance.local_roughness import local_roughness
 from shared.appearance.maps import make_maps
-from shared.appearance.solver import AppearanceSolver
+from shared.appearance.problem import AppearanceProblem
 from shared.appearance.texture_pass import Clip, TexturePass
 from shared.capture.chart import ChartObservation
 from shared.geometry.mesh import uniform_laplacian
@@ -87,11 +89,17 @@ def solve_clip(
 
 
 def examine(lit: LitClip) -> tuple[dict[str, float], Solution]:
-    """What the samples show beside the light: signs of what the model cannot follow, and roughness that varies."""
-    solver, inputs = AppearanceSolver.at(lit.capture, lit.settings.appearance, lit.solution.state), lit.inputs
+    """What the samples show beside the light: diagnostics of what the model cannot follow, and the solution with
+    roughness that varies over the skin where that serves."""
+    settings, solution, inputs = lit.settings.appearance, lit.solution, lit.inputs
+    problem = AppearanceProblem.of(lit.capture, settings)
     positions = lit.capture.points.positions
     regions = face_regions(inputs.mesh, inputs.face_segment, inputs.segment_names, positions)
-    return diagnostics_of(solver, regions), with_local_roughness(solver, lit.solution)
+    diagnostics = diagnostics_of(problem, solution.state, regions)
+    if settings.specular and settings.local_roughness:
+        fit, said = local_roughness(problem, solution.state)
+        solution = replace(solution, local_roughness_fit=fit, roughness_record=said)
+    return diagnostics, solution
 
 
 def scalp_of(inputs: InverseInputs) -> np.ndarray | None:

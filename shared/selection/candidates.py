@@ -29,7 +29,7 @@ import numpy as np
 
 from shared.appearance.fit import Solution, fit_appearance
 from shared.appearance.observations import Capture
-from shared.appearance.solver import AppearanceSettings, AppearanceSolver
+from shared.appearance.problem import AppearanceProblem, AppearanceSettings
 
 LIGHTS = {
     "harmonics_2": ("harmonics_2", 8),
@@ -224,14 +224,14 @@ class ModelSelection:
         changed = self.present is not None and model.light != self.present.model.light
         shapes = not keeps_start or changed and not model.light.startswith("cubemap")
         if start is None:
-            start = Solution(AppearanceSolver(capture, settings).state, (), np.inf, np.inf)
+            start = Solution(AppearanceProblem.of(capture, settings).uniform_start(), (), np.inf, np.inf)
         else:
             settings = replace(settings, steps=min(settings.steps, SELECTION_STEPS))
         if changed:  # another light, another chance for highlights
-            start = replace(start, trusted=True)
+            start = replace(start, highlights_count=True)
         if settings.specular and start.state.specular == 0.0:
             fresh = replace(start.state, specular=settings.specular_prior[0], roughness=settings.roughness)
-            start, keeps_start, shapes = replace(start, state=fresh, trusted=True), False, True
+            start, keeps_start, shapes = replace(start, state=fresh, highlights_count=True), False, True
         solution = fit_appearance(
             capture, settings, start=start, keep_start=keeps_start, least=FINE_MOVES if fine else MOVES,
             shapes=settings.specular and shapes,

@@ -19,7 +19,8 @@ from scipy.spatial import cKDTree
 from shared.appearance.fit import Solution
 from shared.appearance.local_roughness import SpecularEquations, specular_equations_of
 from shared.appearance.observations import Capture
-from shared.appearance.solver import AppearanceSettings, AppearanceSolver
+from shared.appearance.problem import AppearanceProblem, AppearanceSettings
+from shared.appearance.projection import best_albedo
 from shared.selection.candidates import LOOK_AHEAD, Trial, describe, serves
 
 VARIATIONS = ("one_value", "by_segment", "local")
@@ -80,13 +81,16 @@ class SpecularSelection:
         candidates: Mapping[str, tuple[str, ...]],
         report: Callable[[dict], None],
     ):
-        self.solver = solver = AppearanceSolver.at(capture, settings, trial.solution.state)
-        solver.bake_lobes()
-        self.irradiance, self.reflection = solver.forward(solver.state.light)
-        model = solver.model(self.irradiance, self.reflection)
-        self.weight = solver.weights(model)
-        solver.measure_reduced_chi_square(model, self.weight)
-        local = specular_equations_of(solver, self.irradiance, self.weight * solver.fitted)
+        self.problem, self.state = AppearanceProblem.of(capture, settings), trial.solution.state
+        transport = self.problem.transport(self.state)
+        self.irradiance, self.reflection = transport.forward(self.state.light)
+        model = self.state.radiance(self.irradiance, self.reflection)
+        self.weight = self.problem.errors.weights(model)
+        errors = self.problem.errors.with_reduced_chi_square(model, self.weight)
+        self.transport = replace(transport, lobes=None)
+        local = specular_equations_of(
+            self.problem, self.state, self.transport, errors, self.irradiance, self.weight * errors.fitted
+        )
         self.pools: dict[str, SpecularEquations | None] = {"one_value": None, "local": local}
         if segment is not None:
             by_segment = SegmentSpecular(**vars(local), segment=segment)
@@ -112,15 +116,15 @@ class SpecularSelection:
         return SpecularVariation(**chosen, **{f"{part}_equations": self.pools[name] for part, name in chosen.items()})
 
     def _try(self, chosen: Mapping[str, str]) -> Trial:
-        begun, solver = time.perf_counter(), self.solver
+        begun, problem, state = time.perf_counter(), self.problem, self.state
         specular, roughness = (self.pools[chosen[part]] for part in ("specular", "roughness"))
-        positions, reflection = solver.capture.points.positions, self.reflection
+        positions, reflection = problem.capture.points.positions, self.reflection
         if roughness is not None:
-            solver.bake_lobes(np.maximum(roughness.roughness(positions), solver.table.narrowest))
-            reflection = solver.forward(solver.state.light)[1]
-        intensity = solver.state.specular if specular is None else specular.specular_at(positions)
+            each = np.maximum(roughness.roughness(positions), problem.table.narrowest)
+            reflection = replace(self.transport, lobes=problem.lobes_of_each(each)).forward(state.light)[1]
+        intensity = state.specular if specular is None else specular.specular_at(positions)
         intensity = np.broadcast_to(intensity, len(positions)).astype(np.float32)
         shown = reflection * torch.from_numpy(intensity)[None, :, None]
-        albedo = solver.best_albedo(self.irradiance, shown, self.weight)
-        errors = solver.frame_errors(albedo * self.irradiance + shown)[~solver.capture.fitted]
+        albedo = best_albedo(problem.errors, self.irradiance, shown, self.weight, problem.typical_albedo(state))
+        errors = problem.errors.frame_errors(albedo * self.irradiance + shown)[~problem.capture.fitted]
         return replace(self.trial, errors=errors, seconds=time.perf_counter() - begun)

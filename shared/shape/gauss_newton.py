@@ -16,7 +16,7 @@ import scipy.sparse as sparse
 from shared.appearance.fit import Solution
 from shared.appearance.local_roughness import SpecularEquations
 from shared.appearance.observations import face_front
-from shared.appearance.solver import AppearanceSettings
+from shared.appearance.problem import AppearanceSettings
 from shared.compute.read_ahead import read_ahead
 from shared.geometry.mesh import Mesh, subdivide, vertex_normals
 from shared.imaging.image_sampling import SurfaceViewer

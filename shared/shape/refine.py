@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import cKDTree
 
-from shared.appearance.solver import AppearanceSettings
+from shared.appearance.problem import AppearanceSettings
 from shared.geometry.intersections import move_without_crossing
 from shared.geometry.mesh import Mesh, subdivide
 from shared.imaging.frame_index import lens_of_frames

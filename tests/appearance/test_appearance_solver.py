@@ -10,15 +10,22 @@ from toy_capture import (
     MATTE,
     ROUGHNESS,
     SPECULAR,
+    linearised,
     make_truth,
-    solver_of,
-    true_albedo,
+    started,
     true_light,
+    under_true_light,
 )
 
-from shared.appearance.light_step import LightStep
-from shared.appearance.solver import AppearanceSettings, AppearanceSolver
-from shared.appearance.specular_fit import SpecularFit
+from shared.appearance.fit import FitState, step
+from shared.appearance.problem import AppearanceProblem, AppearanceSettings
+from shared.appearance.projection import (
+    SpecularFit,
+    best_albedo,
+    changed_roughness,
+    measure_highlights,
+    project_off_albedo,
+)
 from shared.rendering.envmap import cube_directions
 from shared.rendering.lobes import SpecularTransfer, specular_reflection
 from shared.rendering.shading import light_along
@@ -27,48 +34,44 @@ from shared.rendering.transfer import nearest_points
 GLOSSY = replace(MATTE, specular=True, roughness=ROUGHNESS)
 
 
-def truly_lit(solver, capture):
-    """What the solver's forward model gives under the true light and the true node albedo."""
-    solver.set_light(("cubemap", 16))
-    solver.state.node_albedo = true_albedo(capture.nodes.points.positions)
-    solver.bake()
-    return solver.forward(true_light(cube_directions(16)))
+def truly_lit(capture, settings):
+    """The problem, its state under the true light and node albedo, and what the forward model gives there."""
+    problem, state = under_true_light(capture, settings)
+    if not settings.specular:
+        state = replace(state, specular=0.0)
+    return problem, state, *problem.transport(state).forward(state.light)
 
 
 def test_errors_of_frames_are_those_of_their_samples(truth):
     """A frame that is off by 0.1 everywhere says so; samples that count less are believed less; clipped ones stay
     silent where the model agrees with them."""
     capture = truth[0]
-    solver = solver_of(capture)
-    model = solver.colours.clone()
+    errors = AppearanceProblem.of(capture, MATTE).errors
+    model = errors.colours.clone()
     model[:, :, 3] += 0.1
     seen = capture.samples.weight.sum(0) > 0
-    assert seen.all() and solver.frame_errors(model) == pytest.approx(np.where(np.arange(len(seen)) == 3, 0.1, 0.0))
+    assert seen.all() and errors.frame_errors(model) == pytest.approx(np.where(np.arange(len(seen)) == 3, 0.1, 0.0))
     half = np.arange(len(capture.points)) % 2 == 0
-    model = solver.colours + 0.1 * torch.from_numpy(half.astype(np.float32))[None, :, None]
+    model = errors.colours + 0.1 * torch.from_numpy(half.astype(np.float32))[None, :, None]
     share = capture.samples.weight[half].sum(0) / capture.samples.weight.sum(0)
-    assert solver.frame_errors(model) == pytest.approx(0.1 * share, rel=1e-4)
-    solver.saturation[:] = 1
-    assert solver.frame_errors(model).max() == 0.0
+    assert errors.frame_errors(model) == pytest.approx(0.1 * share, rel=1e-4)
+    clipped = replace(errors, saturation=torch.ones_like(errors.saturation))
+    assert clipped.frame_errors(model).max() == 0.0
 
 
 def test_samples_that_the_model_cannot_follow_say_less(matte):
-    solver = solver_of(matte[0])
-    weight = torch.ones_like(solver.colours)
-    fitting = solver.evidence(weight)
+    errors = AppearanceProblem.of(matte[0], MATTE).errors
+    weight = torch.ones_like(errors.colours)
     error = 2.0 * torch.ones_like(weight)
-    solver.measure_reduced_chi_square(solver.colours + error, weight)
-    assert solver.evidence(weight) == pytest.approx(fitting / 4.0, rel=1e-3)
-    solver.measure_reduced_chi_square(solver.colours + 0.1 * error, weight)
-    assert solver.evidence(weight) == pytest.approx(fitting, rel=1e-6)
+    doubtful = errors.with_reduced_chi_square(errors.colours + error, weight)
+    assert doubtful.evidence(weight) == pytest.approx(errors.evidence(weight) / 4.0, rel=1e-3)
+    sure = errors.with_reduced_chi_square(errors.colours + 0.1 * error, weight)
+    assert sure.evidence(weight) == pytest.approx(errors.evidence(weight), rel=1e-6)
 
 
 def test_forward_model_is_the_composition_of_its_modules(truth):
     capture, _, light = truth
-    solver = AppearanceSolver(capture, GLOSSY)
-    solver.state.specular = SPECULAR
-    solver.bake_lobes()
-    found, reflection = truly_lit(solver, capture)
+    _, _, found, reflection = truly_lit(capture, GLOSSY)
     assert np.allclose(np.moveaxis(found.numpy(), 0, -1), light, rtol=0.01)
     table = SpecularTransfer(capture.points.normals, capture.transfer.visibility(), DIRECTIONS)
     along = light_along(true_light(cube_directions(16)), DIRECTIONS, capture.world_from_head)
@@ -77,13 +80,40 @@ def test_forward_model_is_the_composition_of_its_modules(truth):
     assert np.allclose(reflection[:, :, 3].numpy().T[open_points], expected[open_points], rtol=0.02, atol=1e-3)
 
 
+@pytest.mark.parametrize("settings", [MATTE, GLOSSY], ids=["matte", "glossy"])
+def test_rendering_and_its_adjoint_are_transposes(truth, settings):
+    """<render(l), v> = <l, render_adjoint(v)> for any light and any values, and so with the irradiance alone."""
+    problem, state, irradiance, _ = truly_lit(truth[0], settings)
+    transport, rng = problem.transport(state), np.random.default_rng(3)
+    light = rng.uniform(size=state.light.shape)
+    values = torch.from_numpy(rng.uniform(size=irradiance.shape).astype(np.float32))
+    albedo = torch.from_numpy(rng.uniform(size=(3, irradiance.shape[1], 1)).astype(np.float32))
+    rendered = float((transport.render(light, albedo, 0.5) * values).double().sum())
+    assert (light * transport.render_adjoint(values, albedo, 0.5)).sum() == pytest.approx(rendered, rel=1e-4)
+    lit = float((transport.forward(light)[0] * values).double().sum())
+    assert (light * transport.irradiance_adjoint(values)).sum() == pytest.approx(lit, rel=1e-4)
+
+
+def test_a_step_leaves_its_state_as_it_was(truth):
+    """States are values: the same step from the same state twice gives the same, to the last bit."""
+    problem, appearance = started(truth[0], GLOSSY)
+    state = FitState(appearance, problem.errors)
+    before = appearance.params.copy(), appearance.albedo.copy(), problem.errors.precision.clone()
+    first, second = (step(problem, state, highlights_count=True)[0] for _ in range(2))
+    assert np.array_equal(appearance.params, before[0]) and np.array_equal(appearance.albedo, before[1])
+    assert torch.equal(state.errors.precision, before[2]) and state.errors.reduced_chi_square == 1.0
+    assert np.array_equal(first.appearance.params, second.appearance.params)
+    assert np.array_equal(first.appearance.albedo, second.appearance.albedo)
+    assert first.appearance.roughness == second.appearance.roughness != appearance.roughness
+
+
 def test_projected_albedo_is_weighted_least_squares(matte):
     """Albedo under the true light by brute force, and the truth itself to the noise."""
     capture, albedo, _ = matte
-    solver = AppearanceSolver(capture, MATTE)
-    light, reflection = truly_lit(solver, capture)
-    weight = solver.weights(None)
-    found = solver.best_albedo(light, 0.0 * reflection, weight)[..., 0].numpy().T
+    problem, _, light, reflection = truly_lit(capture, MATTE)
+    weight = problem.errors.weights(None)
+    typical = problem.typical_albedo(problem.uniform_start())
+    found = best_albedo(problem.errors, light, 0.0 * reflection, weight, typical)[..., 0].numpy().T
     assert np.abs(found / albedo - 1.0).max() < 0.03
     frames = capture.fitted
     for p in range(0, len(albedo), 40):
@@ -105,11 +135,9 @@ def test_highlights_are_joint_least_squares(truth):
         transfer=capture.transfer.take(some),
         skin=capture.skin[some],
     )
-    solver = AppearanceSolver(capture, GLOSSY)
-    solver.bake_lobes()
-    light, reflection = truly_lit(solver, capture)
-    weight = solver.weights(None) * solver.fitted
-    found = solver.highlights(light, reflection, weight).intensity
+    problem, _, light, reflection = truly_lit(capture, GLOSSY)
+    weight = problem.errors.weights(None) * problem.errors.fitted
+    found = measure_highlights(problem.errors, light, reflection, weight).intensity
     points = len(some)
     for c in range(3):
         rows, columns = np.nonzero(weight[c].numpy() > 0)
@@ -127,38 +155,36 @@ def test_clipped_samples_do_not_bias(one_thread):
     """Many red samples end at the clipping level; the light being known, albedo must not suffer."""
     capture, albedo, _ = make_truth(specular=0.0, clip_at=0.45)
     clipped = (capture.samples.saturation[..., 0] > 0) & (capture.samples.weight > 0)
-    solver = AppearanceSolver(capture, MATTE)
-    light, reflection = truly_lit(solver, capture)
+    problem, state, light, reflection = truly_lit(capture, MATTE)
+    errors, typical = problem.errors, problem.typical_albedo(problem.uniform_start())
     used = (capture.samples.weight > 0) & capture.fitted
     share = (clipped & used).sum(1) / used.sum(1)
     partly = (share > 0.3) & ((used & ~clipped).sum(1) >= 2)
     assert partly.sum() > 20
 
     def error(weight):
-        found = solver.best_albedo(light, 0.0 * reflection, weight)[0, :, 0].numpy()
+        found = best_albedo(errors, light, 0.0 * reflection, weight, typical)[0, :, 0].numpy()
         return float(np.median(found[partly] / albedo[partly, 0])) - 1.0
 
-    solver.state.albedo = albedo
-    assert abs(error(solver.weights(solver.model(light, reflection)))) < 0.005
-    assert error(solver.trust * solver.precision) < -0.03
+    true_radiance = replace(state, albedo=albedo).radiance(light, reflection)
+    assert abs(error(errors.weights(true_radiance))) < 0.005
+    assert error(errors.view_weight * errors.precision) < -0.03
     above = light * 0 + 2.0
-    assert float(solver.weights(above)[0].numpy()[clipped].max()) == 0.0
-    assert float(solver.weights(above * 0)[0].numpy()[clipped].min()) > 0.0
+    assert float(errors.weights(above)[0].numpy()[clipped].max()) == 0.0
+    assert float(errors.weights(above * 0)[0].numpy()[clipped].min()) > 0.0
 
 
 @pytest.mark.parametrize("settings", [MATTE, replace(MATTE, bounce=False), GLOSSY], ids=["matte", "direct", "glossy"])
 def test_gradient_is_the_derivative_of_the_cost(truth, settings):
     """Along random directions under a light of too little contrast; what is eliminated is fitted anew at both ends."""
-    solver = solver_of(truth[0], settings)
-    solver.trust_highlights = settings.specular
+    problem, state = started(truth[0], settings)
     rng = np.random.default_rng(0)
-    solver.state.params = 0.6 * np.log(true_light(cube_directions(6)))
-    step = LightStep(solver)
-    gradient, slopes, expected = step.gradient(), [], []
+    linear = linearised(problem, replace(state, params=0.6 * np.log(true_light(cube_directions(6)))), settings.specular)
+    gradient, params, slopes, expected = linear.gradient(), linear.state.params, [], []
     for _ in range(6):
         change = rng.normal(size=gradient.shape)
         change *= 0.05 / np.linalg.norm(change)
-        ahead, behind = (step.cost(solver.state.params + sign * change) for sign in (1, -1))
+        ahead, behind = (linear.cost(params + sign * change) for sign in (1, -1))
         slopes.append((ahead - behind) / 2.0)
         expected.append((gradient * change).sum())
     assert np.allclose(slopes, expected, atol=0.01 * np.abs(expected).max())
@@ -166,69 +192,61 @@ def test_gradient_is_the_derivative_of_the_cost(truth, settings):
 
 @pytest.mark.parametrize("settings", [MATTE, GLOSSY], ids=["matte", "glossy"])
 def test_gauss_newton_product_is_symmetric_and_positive(truth, settings):
-    solver = solver_of(truth[0], settings)
-    solver.trust_highlights = settings.specular
-    step = LightStep(solver)
-    step.gradient()
+    linear = linearised(*started(truth[0], settings), settings.specular)
     rng = np.random.default_rng(1)
     a, b = rng.normal(size=(2, 6 * 6**2, 3))
-    size = (a * step.product(a)).sum()
+    size = (a * linear.product(a)).sum()
     assert size > 0
-    assert (a * step.product(b)).sum() == pytest.approx((b * step.product(a)).sum(), abs=3e-3 * size)
+    assert (a * linear.product(b)).sum() == pytest.approx((b * linear.product(a)).sum(), abs=3e-3 * size)
     # What only scales the light is absorbed by the albedo.
     scale = np.ones((6 * 6**2, 3))
-    assert abs((scale * step.product(scale)).sum()) < 3e-3 * size
+    assert abs((scale * linear.product(scale)).sum()) < 3e-3 * size
 
 
 def test_steps_lower_the_cost_and_keep_the_mean_irradiance(matte):
-    capture, _, _ = matte
-    solver = solver_of(capture)
-    step = LightStep(solver)
-    _, before, gauge = solver.mean_on_skin(step.albedo, step.irradiance)
-    assert np.allclose((solver.state.light * gauge).sum(0), 1.0, rtol=1e-3)
-    step.update()
-    assert step.cost(solver.state.params) < 0.5 * step.before
-    _, after, _ = solver.mean_on_skin(step.albedo, solver.forward(solver.state.light)[0])
-    assert np.abs(after - before).max() < 0.5
+    linear = linearised(*started(matte[0]))
+    problem, transport, model = linear.problem, linear.transport, linear.state.light_model
+    _, before, gauge = problem.mean_on_skin(linear.albedo, linear.irradiance, transport)
+    assert np.allclose((linear.state.light * gauge).sum(0), 1.0, rtol=1e-3)
+    params, cost = linear.improved_light()
+    assert cost == linear.cost(linear.state.params) and linear.cost(params) < 0.5 * cost
+    lit = transport.forward(model.radiance(params))[0]
+    assert np.abs(problem.mean_on_skin(linear.albedo, lit, transport)[1] - before).max() < 0.5
 
 
 def test_roughness_comes_to_the_truth_under_the_true_light(truth):
     """In a few linearised steps, from either side."""
-    capture, _, _ = truth
     for start in (0.3, 0.55):
-        solver = AppearanceSolver(capture, replace(MATTE, specular=True, resolutions=(16,), roughness=start))
-        solver.trust_highlights = True
-        solver.state.params, solver.state.specular = np.log(true_light(cube_directions(16))), SPECULAR
-        solver.state.node_albedo = true_albedo(capture.nodes.points.positions)
-        solver.bake()
-        solver.bake_lobes()
+        settings = replace(MATTE, specular=True, resolutions=(16,), roughness=start)
+        problem, state = under_true_light(truth[0], settings)
+        state = replace(state, albedo=problem.uniform_start().albedo)
         for _ in range(5):
-            solver.update_roughness(LightStep(solver).specular_fit.change_of_roughness)
-        assert solver.state.roughness == pytest.approx(ROUGHNESS, rel=0.03)
+            linear = linearised(problem, state, highlights_count=True)
+            change = linear.specular_fit.change_of_roughness
+            state = replace(linear.state, roughness=changed_roughness(state.roughness, change))
+        assert state.roughness == pytest.approx(ROUGHNESS, rel=0.03)
 
 
 def test_intensity_and_roughness_are_joint_least_squares(truth):
     """Moved by what they are off by, and what is left of a change that they can make up for."""
     capture, albedo, _ = truth
-    solver = AppearanceSolver(capture, replace(GLOSSY, specular_prior=(0.7, 100.0)))
-    solver.state.specular = SPECULAR
-    solver.bake_lobes()
-    solver.bake_slopes()
-    light, reflection = truly_lit(solver, capture)
-    slope = solver.forward_slope(true_light(cube_directions(16)), light)
+    settings = replace(GLOSSY, specular_prior=(0.7, 100.0))
+    problem, state, light, reflection = truly_lit(capture, settings)
+    transport = problem.transport(state)
+    slope = transport.roughness_slope(transport.lobes.slopes(), state.light, light)
     diffuse = torch.from_numpy(albedo.T.astype(np.float32))[..., None] * light
-    weight = solver.weights(None) * solver.fitted
+    weight = problem.errors.weights(None) * problem.errors.fitted
     change = 0.1 * reflection - 0.2 * SPECULAR * slope
-    solver.colours = diffuse + SPECULAR * reflection + change
-    fit = SpecularFit(solver, light, reflection, slope, weight, 1e3)
+    errors = replace(problem.errors, colours=diffuse + SPECULAR * reflection + change)
+    fit = SpecularFit(settings, state, errors, light, reflection, slope, weight, 1e3)
     assert np.allclose(fit.best, [SPECULAR + 0.1, -0.2], rtol=0.01)
     assert torch.allclose(fit.highlights, SPECULAR * reflection + change, atol=1e-3)
-    pure = solver.project_off_albedo(change, light, weight)
-    assert float((weight * fit.off(pure).square()).sum()) < 1e-3 * float((weight * pure.square()).sum())
+    pure = project_off_albedo(change, light, weight)
+    assert float((weight * fit.project_off(pure).square()).sum()) < 1e-3 * float((weight * pure.square()).sum())
     # Known in advance, they stay.
     certain = replace(GLOSSY, specular_prior=(0.7, 1e-6))
-    solver.settings = certain
-    assert SpecularFit(solver, light, reflection, None, weight, 1e3).best == pytest.approx([0.7], abs=1e-3)
+    fit = SpecularFit(certain, state, errors, light, reflection, None, weight, 1e3)
+    assert fit.best == pytest.approx([0.7], abs=1e-3)
 
 
 def test_light_between_surfaces_that_send_everything_on_comes_to_an_end(truth):
@@ -236,27 +254,25 @@ def test_light_between_surfaces_that_send_everything_on_comes_to_an_end(truth):
     capture = truth[0]
     count = len(capture.nodes.points)
     closed = replace(capture.node_transfer, bounce=np.full((count, count), 1.0 / count, np.float32))
-    solver = AppearanceSolver(replace(capture, node_transfer=closed), AppearanceSettings(specular=False))
-    solver.state.node_albedo[:] = 1.0
-    solver.bake()
-    assert torch.isfinite(solver.baked).all() and (solver.baked >= solver.direct).all()
+    problem, state = started(replace(capture, node_transfer=closed), AppearanceSettings(specular=False))
+    total = problem.total_transfer(replace(state, node_albedo=np.ones_like(state.node_albedo)))
+    assert torch.isfinite(total).all() and (total >= problem.direct).all()
 
 
 def test_nodes_take_the_albedo_of_points_beside_them(truth):
     capture, _, _ = truth
-    solver = AppearanceSolver(capture, MATTE)
-    assert np.array_equal(solver.node_to_point, nearest_points(capture.nodes.points, capture.points))
+    problem = AppearanceProblem.of(capture, MATTE)
+    assert np.array_equal(problem.node_to_point, nearest_points(capture.nodes.points, capture.points))
 
 
 def test_points_of_few_samples_follow_the_scale(matte):
     """The pull on them is towards skin of the scale that was found, not of the one before."""
     capture, _, _ = matte
     faint = replace(capture, samples=replace(capture.samples, weight=1e-3 * capture.samples.weight))
-    solver = AppearanceSolver(faint, replace(MATTE, bounce=False))
-    solver.bake()
-    solver.state.params += np.log(4.0)
-    solver.state.albedo /= 4.0
-    step = LightStep(solver)
-    assert step.resolve_scale() > 1.0
-    again = solver.best_albedo(step.irradiance, torch.zeros_like(step.irradiance), step.weight)
-    assert float((step.albedo / again - 1.0).abs().max()) < 0.1
+    problem, state = started(faint, replace(MATTE, bounce=False))
+    linear = linearised(problem, replace(state, params=state.params + np.log(4.0), albedo=state.albedo / 4.0))
+    resolved = linear.resolved_scale(linear.state.params)
+    assert resolved.rescaled > 1.0
+    again = best_albedo(problem.errors, resolved.irradiance, torch.zeros_like(resolved.irradiance), linear.weight,
+                        problem.typical_albedo(resolved.state))
+    assert float((resolved.albedo / again - 1.0).abs().max()) < 0.1

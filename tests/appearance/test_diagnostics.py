@@ -16,7 +16,7 @@ from shared.appearance.diagnostics import (
     unlikely_colour,
 )
 from shared.appearance.fit import fit_appearance
-from shared.appearance.solver import AppearanceSettings, AppearanceSolver
+from shared.appearance.problem import AppearanceProblem, AppearanceSettings
 from shared.errors import InputError
 from shared.io.images import write_exr
 from stages.inverse_render import check
@@ -32,7 +32,7 @@ def capture(one_thread):
 def diagnostics(capture, colours=None, regions=None):
     if colours is not None:
         capture = replace(capture, samples=replace(capture.samples, colours=colours.astype(np.float32)))
-    return diagnostics_of(AppearanceSolver.at(capture, MATTE, fit_appearance(capture, MATTE).state), regions)
+    return diagnostics_of(AppearanceProblem.of(capture, MATTE), fit_appearance(capture, MATTE).state, regions)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,8 @@ from toy_capture import (
 )
 
 from shared.appearance.fit import fit_appearance
-from shared.appearance.solver import AppearanceSettings, AppearanceSolver
+from shared.appearance.problem import AppearanceSettings
+from shared.appearance.projection import changed_roughness
 from shared.contract.fields import below, field_faults
 from shared.contract.records import SOLVE
 from shared.geometry.mesh import normalised
@@ -92,7 +93,7 @@ def test_the_fit_goes_on_until_the_scale_rests(truth):
     """Highlights tell the scale, step by step, while the residual stays."""
     settings = AppearanceSettings(resolutions=(8,), steps=20, noise=(0.003, 0.01), roughness=0.45)
     found = fit_appearance(truth[0], settings)
-    assert found.trusted and len(after_shaping(found)) > 2 and len(found.iterations) < 20
+    assert found.highlights_count and len(after_shaping(found)) > 2 and len(found.iterations) < 20
     assert found.iterations[-1]["rescaled"] < 0.01
 
 
@@ -123,9 +124,9 @@ def test_highlights_join_a_light_that_was_found_without_them():
     capture, albedo, _ = make_truth(lights=(coloured_light,))
     settings = AppearanceSettings(resolutions=(8,), steps=12, noise=(0.003, 0.01), roughness=0.45)
     matte = fit_appearance(capture, replace(settings, specular=False))
-    start = replace(matte, state=replace(matte.state, specular=0.7, roughness=0.45), trusted=True)
+    start = replace(matte, state=replace(matte.state, specular=0.7, roughness=0.45), highlights_count=True)
     found = fit_appearance(capture, settings, start=start, shapes=True)
-    assert found.iterations[0]["shaping"] and not found.iterations[-1]["shaping"] and found.trusted
+    assert found.iterations[0]["shaping"] and not found.iterations[-1]["shaping"] and found.highlights_count
     assert found.held_out < 0.6 * matte.held_out
     assert abs(found.state.roughness - ROUGHNESS) < 0.02
     assert np.abs(np.log(np.median(found.state.albedo / albedo, axis=0))).max() < 0.2
@@ -152,8 +153,8 @@ def test_a_fit_goes_on_from_a_solution(truth, solution):
     assert {record["resolution"] for record in again.iterations} == {8}
     assert len(again.iterations) <= 8
     assert again.held_out < 1.02 * solution.held_out
-    distrustful = fit_appearance(truth[0], settings, start=replace(solution, trusted=False))
-    assert not distrustful.trusted and again.trusted
+    without = fit_appearance(truth[0], settings, start=replace(solution, highlights_count=False))
+    assert not without.highlights_count and again.highlights_count
 
 
 def test_a_step_that_leads_away_is_undone_and_ends_its_resolution(truth, monkeypatch):
@@ -161,20 +162,21 @@ def test_a_step_that_leads_away_is_undone_and_ends_its_resolution(truth, monkeyp
     from shared.appearance import fit as module
 
     capture, _, _ = truth
-    honest, trusted = module._step, []
+    honest, counted = module.step, []
 
-    def spoilt(solver, settings, trusts, moves):
-        trusted.append(trusts)
-        record, rise, by_frame = honest(solver, settings, trusts, moves)
-        if trusts:
-            solver.state.albedo = solver.state.albedo * 0.5
-            return record | {"held_out": 3.0 * record["held_out"]}, 3.0 * rise, by_frame
-        return record, rise, by_frame
+    def spoilt(problem, state, highlights_count, light_moves):
+        counted.append(highlights_count)
+        state, found = honest(problem, state, highlights_count, light_moves)
+        if highlights_count:
+            darker = replace(state.appearance, albedo=state.appearance.albedo * 0.5)
+            return replace(state, appearance=darker), replace(found, held_out=3.0 * found.held_out,
+                                                              rise=3.0 * found.rise)
+        return state, found
 
-    monkeypatch.setattr(module, "_step", spoilt)
+    monkeypatch.setattr(module, "step", spoilt)
     found = fit_appearance(capture, AppearanceSettings(resolutions=(4, 8), steps=5, noise=(0.003, 0.01)))
     undone = [record for record in found.iterations if record.get("undone")]
-    assert len(undone) == 1 and sum(trusted) == 1
+    assert len(undone) == 1 and sum(counted) == 1
     assert field_faults(undone[0], below(SOLVE, "iterations[]")) == []
     shaping = [record for record in found.iterations if record["shaping"]]
     assert undone[0]["step"] == len(shaping) and undone[0]["resolution"] == 4
@@ -191,15 +193,14 @@ def test_the_fit_is_deterministic(matte):
 
 def test_a_roughness_at_the_end_of_its_range_does_not_keep_the_scale_waiting(truth, monkeypatch):
     """Of lobes narrower than may be: what counts is how far the roughness went, so the scale is found all the same."""
-    from shared.appearance import solver as module
+    from shared.appearance import projection as module
 
     monkeypatch.setattr(module, "ROUGHNESS_RANGE", (0.48, 0.7))
     capture, albedo, _ = truth
     settings = AppearanceSettings(resolutions=(8,), steps=12, noise=(0.003, 0.01), roughness=0.55)
-    solver = AppearanceSolver(capture, replace(settings, roughness=0.5))
-    assert solver.update_roughness(-1.0) == pytest.approx(np.log(0.5 / 0.48))
-    assert solver.update_roughness(-1.0) == 0.0 and solver.state.roughness == 0.48
-    assert solver.update_roughness(0.05) == pytest.approx(0.05)
+    assert changed_roughness(0.5, -1.0) == pytest.approx(0.48) == changed_roughness(0.48, -1.0)
+    assert changed_roughness(0.48, 0.05) == pytest.approx(0.48 * np.exp(0.05))
+    assert changed_roughness(0.5, 1.0) == pytest.approx(0.5 * np.exp(module.LARGEST_ROUGHNESS_STEP))
 
     found = fit_appearance(capture, settings)
     assert found.state.roughness == pytest.approx(0.48)

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from toy_capture import DIRECTIONS, FRAMES, make_truth, true_light
+from toy_capture import DIRECTIONS, FRAMES, linearised, make_truth, started, true_light
 
 from shared.appearance.albedo_scale import resolve_scale, scale_prior
 from shared.appearance.fit import fit_appearance
 from shared.appearance.light import LightPriors
 from shared.appearance.light_models import make_light_model
-from shared.appearance.light_step import LightStep
+from shared.appearance.light_step import LinearisedFit
 from shared.appearance.light_weights import weigh_samples
-from shared.appearance.solver import AppearanceSettings, AppearanceSolver
+from shared.appearance.problem import AppearanceSettings
 from shared.appearance.texture import CORRELATED_FRAMES, Noise, NormalEquations, weigh_lights
 from shared.geometry.mesh import normalised
 from shared.geometry.transforms import rotation_from_vector
@@ -74,12 +74,10 @@ def test_one_light_twice_gives_the_same_as_one_light(one_thread):
 def test_gradient_is_that_of_the_cost(pair):
     """Finite differences of the cost along random changes of both lights; the albedo is eliminated in both."""
     capture, _, _ = pair
-    solver = AppearanceSolver(capture, replace(SETTINGS, specular=False))
-    solver.bake()
-    step = LightStep(solver)
-    gradient, params = step.gradient(), solver.state.params
+    linear = linearised(*started(capture, replace(SETTINGS, specular=False)))
+    gradient, params = linear.gradient(), linear.state.params
     change = np.random.default_rng(0).normal(size=params.shape)
-    ahead, behind = (step.cost(params + h * change) for h in (1e-2, -1e-2))
+    ahead, behind = (linear.cost(params + h * change) for h in (1e-2, -1e-2))
     assert (gradient * change).sum() == pytest.approx((ahead - behind) / 2e-2, rel=0.05)
 
 
@@ -98,7 +96,7 @@ def test_lights_of_one_model_are_each_by_itself(name):
     assert cost == pytest.approx(sum(one.prior(part, LightPriors())[0] for part in own))
     assert np.allclose(gradient, np.concatenate([one.prior(part, LightPriors())[1] for part in own]))
     assert np.allclose(hessian(change)[: len(own[0])], one.prior(own[0], LightPriors())[2](change[: len(own[0])]))
-    two.shares = [0.25, 1.0]
+    two = two.with_shares([0.25, 1.0])
     shared = two.prior(params, LightPriors())
     costs = [share * one.prior(part, LightPriors())[0] for share, part in zip(two.shares, own, strict=True)]
     assert shared[0] == pytest.approx(sum(costs))
@@ -115,26 +113,28 @@ def test_samples_count_by_how_well_their_light_knows_the_point(pair):
     """Full weight for the light whose errors a point feels least; where the lamp hardly shines the sky decides; and
     weighing twice is no more than weighing once."""
     capture, _, _ = pair
-    solver = AppearanceSolver(capture, replace(SETTINGS, specular=False))
-    solver.bake()
-    plain = solver.precision.clone()
+    problem, state = started(capture, replace(SETTINGS, specular=False))
+    errors = problem.errors
     for _ in range(8):
-        step = LightStep(solver)
-        step.update()
-        step.resolve_scale()
-        trust = weigh_samples(solver, step.irradiance, solver.model(step.irradiance, step.reflection))
-    assert max(trust) == 1.0 and min(trust) > 0.0
-    lamp, sky = solver.reliability[..., 0], solver.reliability[..., -1]
+        transport = problem.transport(state)
+        linear = LinearisedFit.at(problem, state, transport, errors, highlights_count=False)
+        resolved = linear.resolved_scale(linear.improved_light()[0])
+        state = resolved.state
+        model = state.radiance(resolved.irradiance, resolved.reflection)
+        along = torch.from_numpy(transport.frame_light.along(state.light))
+        errors, weights = weigh_samples(capture, state, errors, along, resolved.irradiance, model)
+        state = replace(state, light_model=state.light_model.with_shares(errors.light_shares))
+    assert max(weights) == 1.0 and min(weights) > 0.0
+    lamp, sky = errors.reliability[..., 0], errors.reliability[..., -1]
     best = torch.maximum(lamp, sky)
     assert best.max() <= 1.0 and best.median() > 0.95, "but for where a shadow ends"
-    bright = step.irradiance[..., :FRAMES].mean((0, 2))
+    bright = resolved.irradiance[..., :FRAMES].mean((0, 2))
     dim = bright < bright.quantile(0.3)
-    pull = (solver.trust * solver.precision * step.irradiance.square()).sum(0)
+    pull = (errors.view_weight * errors.precision * resolved.irradiance.square()).sum(0)
     by_lamp = pull[:, :FRAMES].sum(1) / pull.sum(1)
     assert by_lamp[dim].median() < 0.5 * by_lamp[~dim].median()
-    assert torch.allclose(solver.precision, plain * solver.reliability, rtol=1e-4)
-    assert solver.state.light_model.shares == solver.prior_shares
-    assert solver.prior_shares[0] < solver.prior_shares[1] <= 1.0
+    assert torch.allclose(errors.precision, problem.errors.precision * errors.reliability, rtol=1e-4)
+    assert errors.light_shares[0] < errors.light_shares[1] <= 1.0
 
 
 def test_each_frame_sees_its_own_light():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from toy_capture import ROUGHNESS, SPECULAR, glossy_forehead, make_truth, solver_under_true_light
+from toy_capture import ROUGHNESS, SPECULAR, glossy_forehead, make_truth, under_true_light
 
 from shared.appearance import local_roughness as module
 from shared.appearance.local_roughness import SpecularEquations, local_roughness
@@ -12,7 +12,7 @@ LOGS = np.log(ROUGHNESS) + np.log(module.FACTOR) * np.arange(-module.STEPS, modu
 
 def test_a_glossy_half_is_found_and_kept():
     capture, _, _ = make_truth(roughness_at=glossy_forehead)
-    equations, record = local_roughness(solver_under_true_light(capture))
+    equations, record = local_roughness(*under_true_light(capture))
     assert record["chosen"] == "local"
     height = capture.points.positions[:, 1]
     found = equations.roughness(capture.points.positions)
@@ -23,7 +23,7 @@ def test_a_glossy_half_is_found_and_kept():
 
 def test_one_roughness_everywhere_stays_one():
     capture, _, _ = make_truth()
-    equations, record = local_roughness(solver_under_true_light(capture))
+    equations, record = local_roughness(*under_true_light(capture))
     assert equations is None
     assert record["chosen"] == "one" and record["held_out"]["one"] > 0
 

@@ -7,8 +7,8 @@ import pytest
 from toy_capture import coloured_light, make_truth, swinging
 
 from shared.appearance.fit import fit_appearance
+from shared.appearance.problem import AppearanceSettings
 from shared.appearance.skin_prior import SkinPrior, SkinVariation
-from shared.appearance.solver import AppearanceSettings
 
 SETTINGS = AppearanceSettings(resolutions=(6,), steps=8, specular=False, noise=(0.003, 0.01))
 TAN = np.array([0.50, 0.31, 0.23])

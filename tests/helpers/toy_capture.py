@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 from toy_head import toy_head
 
+from shared.appearance.light_models import make_light_model
+from shared.appearance.light_step import LinearisedFit
 from shared.appearance.observations import Capture
-from shared.appearance.solver import AppearanceSettings, AppearanceSolver
+from shared.appearance.problem import AppearanceProblem, AppearanceSettings
 from shared.geometry.mesh import normalised
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import camera_centres, fibonacci_sphere, rigid, rotation_from_vector, world_from_head
@@ -112,23 +114,29 @@ def make_truth(
     return replace(capture, **parts, skin=skin[index]), albedo[index], light[index]
 
 
-def solver_of(capture, settings=MATTE):
-    """A solver one step into the fit."""
-    solver = AppearanceSolver(capture, settings)
-    solver.bake()
-    if settings.specular:
-        solver.bake_lobes()
-    return solver
+def started(capture, settings=MATTE):
+    """The problem of a capture and the state that its fit starts from."""
+    problem = AppearanceProblem.of(capture, settings)
+    return problem, problem.uniform_start()
 
 
-def solver_under_true_light(capture):
-    """All unknowns but the roughness as they are; baked."""
-    solver = AppearanceSolver(capture, AppearanceSettings(resolutions=(16,), noise=(0.003, 0.01), roughness=ROUGHNESS))
-    solver.state.params, solver.state.specular = np.log(true_light(cube_directions(16))), SPECULAR
-    solver.state.node_albedo = true_albedo(capture.nodes.points.positions)
-    solver.state.albedo = true_albedo(capture.points.positions)
-    solver.bake()
-    return solver
+def linearised(problem, state, highlights_count=False):
+    """The problem at a state, all samples as they are assumed."""
+    return LinearisedFit.at(problem, state, problem.transport(state), problem.errors, highlights_count)
+
+
+def under_true_light(capture, settings=None):
+    """The problem and its state with all unknowns but the roughness as they are."""
+    settings = settings or AppearanceSettings(resolutions=(16,), noise=(0.003, 0.01), roughness=ROUGHNESS)
+    problem, state = started(capture, settings)
+    return problem, replace(
+        state,
+        params=np.log(true_light(cube_directions(16))),
+        light_model=make_light_model("cubemap", 16),
+        specular=SPECULAR,
+        albedo=true_albedo(capture.points.positions),
+        node_albedo=true_albedo(capture.nodes.points.positions),
+    )
 
 
 def glossy_forehead(positions):

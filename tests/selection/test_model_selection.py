@@ -14,12 +14,12 @@ from toy_capture import (
     glossy_forehead,
     hard_light,
     make_truth,
-    solver_under_true_light,
+    under_true_light,
 )
 from toy_head import toy_head
 
 from shared.appearance.fit import Solution
-from shared.appearance.solver import AppearanceSettings
+from shared.appearance.problem import AppearanceSettings
 from shared.contract.fields import below, field_faults
 from shared.contract.job import Parameters
 from shared.contract.records import LADDER_TIMES, RUN, SOLVE
@@ -93,7 +93,7 @@ def variation_of(capture, segment, **candidates):
     """The variation of specular terms that is selected under the true light, and the record."""
     model, records = Model("bounces", "one_value", "cubemap_16"), []
     settings = model.applied(AppearanceSettings(noise=(0.003, 0.01), roughness=ROUGHNESS))
-    state = solver_under_true_light(capture).state
+    state = under_true_light(capture)[1]
     trial = Trial(model, Solution(state, (), 0.0, 0.0), np.zeros(0), 0.0)
     allowed = {"specular": VARIATIONS, "roughness": VARIATIONS} | candidates
     return SpecularSelection(capture, settings, trial, segment, allowed, records.append).select(), records
@@ -106,7 +106,7 @@ def test_gloss_that_differs_by_segment_is_found_and_worn(one_thread):
     variation, records = variation_of(capture, forehead, specular=("one_value",))
     assert variation.roughness == "by_segment" and variation.specular == "one_value"
     assert [record["rung"] for record in records] == ["by_segment", "local"]
-    solution = Solution(solver_under_true_light(capture).state, (), 0.0, 0.0)
+    solution = Solution(under_true_light(capture)[1], (), 0.0, 0.0)
     worn = variation.worn_by(replace(solution, state=replace(solution.state, roughness=1.1 * ROUGHNESS)))
     found = worn.local_roughness_fit.roughness(capture.points.positions)
     assert len(np.unique(found.round(9))) == 2 and worn.local_specular is None

@@ -10,7 +10,7 @@ from shapes import sphere
 from toy_head import toy_head
 from toy_shape import FRAMES, LENS, ROUGHNESS, SIZE, SIZES, SPECULAR, shade, swinging, true_albedo, true_light
 
-from shared.appearance.solver import AppearanceSettings
+from shared.appearance.problem import AppearanceSettings
 from shared.contract.fields import below, field_faults
 from shared.contract.records import SOLVE
 from shared.geometry.mesh import Mesh, interpolate, normalised, tangent_frames, vertex_normals

@@ -1,0 +1,128 @@
+"""The unknowns that are projected out of a step of the light: albedo, and beside it specular intensity and roughness.
+
+Albedo is a weighted least-squares solution per point and channel. With the roughness linearised highlights are
+x0 S + x1 (s S'), with S the reflection at intensity 1 and S' its derivative by the logarithm of the roughness at the
+present roughness, s the present intensity, x0 the new one and x1 the change of the log roughness: linear in both, each
+of which has a normal prior.
+
+References: [Golub1973] and [Kaufman1975] (variable projection).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from shared.appearance.albedo_scale import Highlights
+from shared.appearance.problem import AppearanceSettings, AppearanceState
+from shared.appearance.sample_errors import SampleErrors
+
+MINIMUM_ALBEDO, MAXIMUM_ALBEDO = 0.003, 1.0
+ALBEDO_PULL = 25.0
+"""Precision of the prior on a point's albedo: a standard deviation of 0.2."""
+ROUGHNESS_RANGE, ROUGHNESS_SPREAD = (0.1, 0.7), 0.35
+"""Of skin; the spread is the standard deviation of the prior on its logarithm, about where the fit starts."""
+LARGEST_ROUGHNESS_STEP = 0.08
+"""Of a step, in the logarithm: lobes are linearised, and their peak goes with the inverse fourth power."""
+
+
+def best_albedo(
+    errors: SampleErrors,
+    irradiance: torch.Tensor,
+    highlights: torch.Tensor,
+    weight: torch.Tensor,
+    typical: torch.Tensor,
+) -> torch.Tensor:
+    """Albedo [3, P, 1] that fits best under irradiance beside highlights, samples of weight (all [3, P, F]), from the
+    fitted frames.
+
+    A weak pull to the skin's typical albedo [3, 1, 1] decides where no sample says anything.
+    """
+    weight = weight * errors.fitted
+    moment = (weight * irradiance * (errors.colours - highlights)).sum(2, keepdim=True)
+    curvature = (weight * irradiance * irradiance).sum(2, keepdim=True)
+    albedo = (moment + ALBEDO_PULL * typical) / (curvature + ALBEDO_PULL)
+    return albedo.clamp(MINIMUM_ALBEDO, MAXIMUM_ALBEDO)
+
+
+def project_off_albedo(values: torch.Tensor, irradiance: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """values [3, P, F] minus the part along irradiance [3, P, F] that a change of albedo would absorb; weight
+    [3, P, F] of the samples.
+
+    Exactly orthogonal, without the pull on the albedo: highlights are some percent of the diffuse radiance, and
+    the least remainder of that would pass for them.
+    """
+    along = (weight * irradiance * values).sum(2, keepdim=True)
+    return values - irradiance * along / (weight * irradiance * irradiance).sum(2, keepdim=True).clamp_min(1e-6)
+
+
+def measure_highlights(
+    errors: SampleErrors, irradiance: torch.Tensor, reflection: torch.Tensor, weight: torch.Tensor
+) -> Highlights:
+    """What the samples say about the specular intensity, per channel, with albedo projected out, under irradiance and
+    reflection, samples of weight, all [3, P, F]."""
+    weight = weight * errors.fitted
+    pure = project_off_albedo(reflection, irradiance, weight)
+    moment = (weight * pure * errors.colours).sum((1, 2))
+    curvature = (weight * pure * reflection).sum((1, 2))
+    share = (weight * errors.colours).sum((1, 2)) / (weight * reflection).sum((1, 2))
+    intensity = (moment / curvature.clamp_min(1e-12)).double().numpy()
+    return Highlights(intensity, curvature.double().numpy() * errors.evidence(weight), share.double().numpy())
+
+
+def changed_roughness(roughness: float, change: float) -> float:
+    """The roughness after a change of its logarithm, at most by what lobes may be linearised over and within its range.
+    """
+    change = np.clip(change, -LARGEST_ROUGHNESS_STEP, LARGEST_ROUGHNESS_STEP)
+    return float(np.clip(roughness * np.exp(change), *ROUGHNESS_RANGE))
+
+
+class SpecularFit:
+    """Specular intensity and roughness as samples and priors together have them, under irradiance and reflection
+    [3, P, F], and slope, S', None where the roughness is not sought; state: whose intensity and roughness are
+    linearised about; weight [3, P, F] of the samples, evidence: see SampleErrors.
+
+    best: the intensity and, where it is sought, the change of the log roughness; unlikely: what the priors say against
+    them; highlights [3, P, F]: theirs.
+    """
+
+    def __init__(
+        self,
+        settings: AppearanceSettings,
+        state: AppearanceState,
+        errors: SampleErrors,
+        irradiance: torch.Tensor,
+        reflection: torch.Tensor,
+        slope: torch.Tensor | None,
+        weight: torch.Tensor,
+        evidence: float,
+    ):
+        self._weight, self._evidence = weight, evidence
+        shown = [reflection] if slope is None else [reflection, state.specular * slope]
+        mean, precision = (values[: len(shown)] for values in _prior(settings, state))
+        self._pure = [project_off_albedo(one, irradiance, weight) for one in shown]
+        curvature, moment = np.array([self._moments(one) for one in shown]), self._moments(errors.colours)
+        self._known = evidence * curvature + np.diag(precision)
+        self.best = np.linalg.solve(self._known, evidence * moment + precision * mean)
+        self.unlikely = 0.5 * float((precision * np.square(self.best - mean)).sum())
+        self.highlights = sum(float(x) * one for x, one in zip(self.best, shown, strict=True))
+
+    def _moments(self, values: torch.Tensor) -> np.ndarray:
+        return np.array([float((self._weight * pure * values).sum()) for pure in self._pure])
+
+    def project_off(self, values: torch.Tensor) -> torch.Tensor:
+        """values [3, P, F], free of albedo, minus what a change of intensity and roughness would absorb."""
+        along = np.linalg.solve(self._known / self._evidence, self._moments(values))
+        return values - sum(float(x) * pure for x, pure in zip(along, self._pure, strict=True))
+
+    @property
+    def change_of_roughness(self) -> float:
+        """Of its logarithm; 0 where it is not sought."""
+        return float(self.best[1]) if len(self.best) > 1 else 0.0
+
+
+def _prior(settings: AppearanceSettings, state: AppearanceState) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and precision, each [2], of the specular intensity and of the change of the log roughness."""
+    mean, sigma = settings.specular_prior
+    back = np.log(settings.roughness / state.roughness)
+    return np.array([mean, back]), np.array([(mean * sigma) ** -2, ROUGHNESS_SPREAD**-2])
