@@ -36,19 +36,19 @@ SEEN_WEIGHT = 0.5
 """Texels with less total weight (frames seen head-on) do not count towards their segment's colour."""
 
 
-def average_frames(job: Job, inputs, surface, viewer) -> tuple:
-    """Weighted mean radiance [T, 3] and total weight [T] of the texels over the chosen frames."""
+def average_frames(job: Job, views, texels, viewer) -> tuple:
+    """Weighted mean radiance [T, 3] and total weight [T] of the texels over the chosen views."""
     import numpy as np
 
     from shared.compute.read_ahead import read_ahead
     from shared.imaging.frame_index import spread_frames
 
-    total, weight = np.zeros((len(surface), 3), np.float32), np.zeros(len(surface), np.float32)
-    chosen = spread_frames(len(inputs.camera_from_head), job.params.frames)
-    pictures = read_ahead(map(inputs.picture, job.progress(chosen, "projecting frames", total=len(chosen))))
+    total, weight = np.zeros((len(texels), 3), np.float32), np.zeros(len(texels), np.float32)
+    chosen = spread_frames(len(views), job.params.frames)
+    pictures = read_ahead(map(views.picture, job.progress(chosen, "projecting frames", total=len(chosen))))
     for f, picture in zip(chosen, pictures, strict=True):
-        view = viewer.view(inputs.camera_from_head[f], inputs.intrinsics, inputs.size)
-        samples, _ = surface.samples(surface.frame_view(view, picture, inputs.intrinsics))
+        view = viewer.view(views.camera_from_head[f], views.intrinsics[f], views.size)
+        samples, _ = texels.samples(texels.frame_view(view, picture, views.intrinsics[f]))
         total[samples.rows] += samples.weight[:, None] * samples.colours
         weight[samples.rows] += samples.weight
     return total / np.maximum(weight, 1e-6)[:, None], weight
@@ -96,21 +96,22 @@ def run(job: Job) -> None:
 
     use_baseline_opencv()
     inputs = read_inputs(job.input("sample_frames"), job.input("track_landmarks"))
-    mesh = inputs.mesh
-    surface, viewer = TexelSurface(mesh, job.params.size), SurfaceViewer.of(mesh)
-    mean, weight = average_frames(job, inputs, surface, viewer)
-    names = inputs.segment_names if inputs.face_segment is not None else ("head",)
-    face_segment = np.zeros(len(mesh.faces), np.uint8) if inputs.face_segment is None else inputs.face_segment
-    texel_segment = face_segment[surface.face]
+    surface = inputs.surface
+    texels, viewer = TexelSurface(surface.mesh, job.params.size), SurfaceViewer.of(surface.mesh)
+    mean, weight = average_frames(job, inputs.views, texels, viewer)
+    names, face_segment = surface.segment_names, surface.face_segment
+    if face_segment is None:
+        names, face_segment = ("head",), np.zeros(len(surface.mesh.faces), np.uint8)
+    texel_segment = face_segment[texels.face]
     colours = segment_colours(mean, weight, texel_segment, names)
     palette = np.array([colours[name]["albedo"] for name in names], np.float32)
     filled = np.where((weight > 0)[:, None], mean, palette[texel_segment])
-    mean_image = surface.dilated(surface.to_image(filled))
+    mean_image = texels.dilated(texels.to_image(filled))
     linear = {"colour_space": "lin_rec709_scene"}
     write_exr(job.out / "mean_texture.exr", mean_image, **linear)
-    write_exr(job.out / "segment_albedo.exr", surface.dilated(surface.to_image(palette[texel_segment])), **linear)
-    write_exr(job.out / "weight.exr", surface.to_image(weight), colour_space="data")
-    write_png(job.out / "segments.png", borders_picture(mean_image, surface.to_image(texel_segment, 255)))
+    write_exr(job.out / "segment_albedo.exr", texels.dilated(texels.to_image(palette[texel_segment])), **linear)
+    write_exr(job.out / "weight.exr", texels.to_image(weight), colour_space="data")
+    write_png(job.out / "segments.png", borders_picture(mean_image, texels.to_image(texel_segment, 255)))
     frames_used = min(len(inputs.frame_index), job.params.frames)
     seen_share = round(float((weight > SEEN_WEIGHT).mean()), 4)
     write_json(job.out / "init.json", {"segments": colours, "frames": frames_used, "seen_share": seen_share})

@@ -179,7 +179,7 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light, poses) -
     maps = SurfaceMaps(result.maps["diffuse_albedo"], result.maps["specular_intensity"])
     chosen = spread_frames(len(index), job.params.render_count)
     for f in job.progress(chosen, "re-rendering"):
-        image, _ = render_frame(result.viewer, result.shading, maps, first + f, poses[f], clip.intrinsics, clip.size)
+        image, _ = render_frame(result.viewer, result.shading, maps, first + f, poses[f], clip.lens, clip.views.size)
         write_exr(folder / "renders" / f"{index[f]:06d}.exr", image, colour_space="lin_rec709_scene")
     held_out = index[~result.fitted[first : first + len(index)]]
     return {"render_frames": index[chosen].tolist(), "held_out_frames": held_out.tolist()}
@@ -199,18 +199,19 @@ def read_clips(job: Job) -> tuple:
     return tuple(read_inputs(*pair, params.mesh, params.poses) for pair in folders)
 
 
-def write_shape(job: Job, inputs, mesh) -> None:
-    """mesh.npz with its face segments, and shape.png."""
+def write_shape(job: Job, tracked, mesh) -> None:
+    """mesh.npz with its face segments, and shape.png; tracked: the Surface before."""
     from shared.inverse.problem import FACE_SKIN
     from shared.io.images import write_png
     from shared.io.meshes import save_mesh
     from shared.report.shape_pictures import shape_sheet
-    from shared.shape.refine import RefinedInputs, faces_of, segments_of, subdivided_to
+    from shared.shape.refine import subdivided_to
 
-    segment = segments_of(inputs, mesh)
+    solved = tracked.with_mesh(mesh)
+    segment = solved.face_segment
     save_mesh(job.out / "mesh.npz", mesh, **({} if segment is None else {"face_segment": segment}))
-    face = None if segment is None else faces_of(RefinedInputs(inputs, mesh), FACE_SKIN)
-    write_png(job.out / "shape.png", shape_sheet(subdivided_to(inputs.mesh, mesh), mesh, face))
+    face = None if segment is None else solved.faces_of(FACE_SKIN)
+    write_png(job.out / "shape.png", shape_sheet(subdivided_to(tracked.mesh, mesh), mesh, face))
 
 
 def run(job: Job) -> None:
@@ -218,6 +219,7 @@ def run(job: Job) -> None:
     import numpy as np
 
     from shared.compute.processor import use_baseline_opencv
+    from shared.compute.run_context import RunContext
     from shared.inverse.clip_inputs import read_mean_texture
     from shared.inverse.joint_clips import join_clips
     from shared.inverse.parameters import read_settings
@@ -228,25 +230,26 @@ def run(job: Job) -> None:
     clips = read_clips(job)
     inputs, placed = clips[0], []
     if job.clips:
-        textures = [read_mean_texture(job.input("init_albedo", name), clip.mesh)
+        textures = [read_mean_texture(job.input("init_albedo", name), clip.surface.mesh)
                     for name, clip in zip(job.clips, clips, strict=True)]
         inputs = join_clips(clips, textures)
         placed = [{"name": name, **facts} for name, facts in zip(job.clips, inputs.describe(), strict=True)]
         job.note(f"clips in one head space: {placed}")
     observations = inputs.chart_observations() if job.params.chart else ()
     settings = read_settings(job.params, job.out.parent / CHECKPOINT)
-    result = solve_clip(inputs, settings, job.progress, job.note, observations)
-    record = summarise(inputs, result)
+    views, surface = inputs.views, inputs.surface
+    result = solve_clip(views, surface, settings, RunContext(job.progress, job.note), observations)
+    record = summarise(result, views.moves)
     record["warnings"] += [f"clip {clip['name']} lies {clip['match_px']:.1f} px beside the shared mesh: other lens, "
                            "another expression?" for clip in placed if clip.get("match_px", 0.0) > FAR_PX]
     for text in record["warnings"]:
         job.warn(text)
     write_maps(job, result)
-    write_shape(job, inputs, result.viewer.mesh)
+    write_shape(job, surface, result.viewer.mesh)
     lights, own = np.split(result.solution.state.light, len(clips)), []
-    for k, clip in enumerate(clips):
-        folder, rows = job.out / "clips" / job.clips[k] if k else job.out, np.nonzero(inputs.light_index == k)[0]
-        own.append(write_clip(job, folder, clip, rows[0], result, lights[k], inputs.camera_from_head[rows]))
+    for k, (clip, rows) in enumerate(zip(clips, views.frames_of_lights, strict=True)):
+        folder = job.out / "clips" / job.clips[k] if k else job.out
+        own.append(write_clip(job, folder, clip, rows[0], result, lights[k], views.camera_from_head[rows]))
     record |= own[0]
     if job.clips:
         record["clips"] = [clip | frames for clip, frames in zip(placed, own, strict=True)]

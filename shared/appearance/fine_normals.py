@@ -11,21 +11,21 @@ References: [Horn1975] (shape from shading); [Mikkelsen2008] (tangents of MikkTS
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from shared.appearance.texture import CORRELATED_FRAMES, Noise, TexelMaterial, robust_weight
-from shared.appearance.texture_pass import Clip
 from shared.compute.compiled import compiled
 from shared.compute.read_ahead import read_ahead
+from shared.compute.run_context import SILENT, RunContext
 from shared.compute.threads import share_out
 from shared.geometry.mesh import Mesh, normalised, vertex_adjacency
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import FrameView, TexelSurface
+from shared.imaging.views import Views
 from shared.rendering.normal_derivatives import IrradianceVectors, Reflections
 from shared.rendering.shading import VertexShading
 
@@ -126,14 +126,13 @@ class NormalPass:
         surface: TexelSurface,
         viewer: SurfaceViewer,
         shading: VertexShading,
-        clip: Clip,
+        views: Views,
         material: TexelMaterial,
-        progress: Callable = lambda items, label: items,
+        context: RunContext = SILENT,
         noise: Noise | None = None,
     ):
-        self.surface, self.viewer, self.shading, self.clip = surface, viewer, shading, clip
-        self.material, self.progress, self.noise = material, progress, noise or Noise()
-        self.intrinsics = np.broadcast_to(clip.intrinsics, (len(clip.fitted), 3, 3))
+        self.surface, self.viewer, self.shading, self.views = surface, viewer, shading, views
+        self.material, self.progress, self.noise = material, context.progress, noise or Noise()
         self.vectors = IrradianceVectors(shading.transfer.visibility(), shading.directions, shading.light_along)
         self.reflections = Reflections(shading, np.arange(len(shading.points)))
         normals = normalised(surface.interpolate(viewer.normals))
@@ -145,7 +144,7 @@ class NormalPass:
     def run(self, pool: float) -> tuple[np.ndarray, dict]:
         """Turns [T, 2], tangents of angles towards growing u and v, and a record. pool: standard width over which
         texels count together, in texels."""
-        fitted, held_out = (np.nonzero(chosen)[0] for chosen in (self.clip.fitted, ~self.clip.fitted))
+        fitted, held_out = (np.nonzero(chosen)[0] for chosen in (self.views.fitted, ~self.views.fitted))
         equations = self.pooled(self.accumulate(fitted[spread_frames(len(fitted), FRAMES)]), pool)
         unseen = self.accumulate(held_out[spread_frames(len(held_out), FRAMES // 4)])
         turns = [most_likely_turns(equations, prior) for prior in PRIORS]
@@ -166,8 +165,8 @@ class NormalPass:
 
     def view(self, f: int) -> FrameView:
         """One frame with E, S [3] and their derivatives by the normal [3, 3] of each vertex, 24 values."""
-        clip, shading = self.clip, self.shading
-        pose, picture, lens = clip.camera_from_head[f], clip.picture(f), self.intrinsics[f]
+        views, shading = self.views, self.shading
+        pose, picture, lens = views.camera_from_head[f], views.picture(f), views.intrinsics[f]
         view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
         slope = self.vectors.frames(slice(f, f + 1))[:, 0]
         gloss, gloss_slope = self.reflections.at(f, shading.points.normals)
@@ -267,9 +266,9 @@ def _add_products(rows, irradiance, derivative, error, weight, per_channel, toge
             together[row, 4] += w * d2 * r
 
 
-def resolved_texels(surface: TexelSurface, clip: Clip) -> float:
+def resolved_texels(surface: TexelSurface, views: Views) -> float:
     """Standard width in texels of what the pictures resolve of the texture where it is largest in them."""
-    px_per_mm = np.max(clip.intrinsics[..., 0, 0]) / np.median(clip.camera_from_head[:, 2, 3])
+    px_per_mm = np.max(views.intrinsics[:, 0, 0]) / np.median(views.camera_from_head[:, 2, 3])
     return max(RESOLVED_PX / WIDTH_OF_DEVIATION / float(px_per_mm * surface.typical_texel_mm()), LEAST_POOL)
 
 

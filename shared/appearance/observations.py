@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from shared.appearance.chart_scale import ChartStatement
+from shared.compute.read_ahead import read_ahead
+from shared.compute.run_context import RunContext
 from shared.geometry.transforms import world_from_head
 from shared.imaging.frame_index import frames_of_lights, spread_frames
-from shared.imaging.image_sampling import Picture, Samples, SurfaceViewer, sample_points_in_frames
+from shared.imaging.image_sampling import Samples, SurfaceViewer, sample_points_in_frames
+from shared.imaging.views import Views
 from shared.rendering.precomputed_transfer import PrecomputedTransfer
 from shared.rendering.shading import DEEP
 from shared.rendering.transfer import Nodes, Points, Transfer, mesh_points, spread_vertices
@@ -24,8 +26,8 @@ class Capture:
 
     points [P] with samples [P, F] and transfer; nodes and their own transfer; directions [J, 3];
     world_from_head [F, 3, 3]; fitted [F] bool (the other frames are held out); skin [P] bool: where the prior on skin
-    reflectance applies; chart: what a colour chart says about the light's scale; light_index [F]: which of several
-    lights each frame stands in, None: there is one.
+    reflectance applies; light_index [F]: which light each frame stands in; chart: what a colour chart says about the
+    light's scale.
     """
 
     points: Points
@@ -37,8 +39,8 @@ class Capture:
     world_from_head: np.ndarray
     fitted: np.ndarray
     skin: np.ndarray
+    light_index: np.ndarray
     chart: ChartStatement | None = None
-    light_index: np.ndarray | None = None
 
     @property
     def frames_of_lights(self) -> list[np.ndarray]:
@@ -61,32 +63,27 @@ def face_front(viewer: SurfaceViewer, camera_from_head: np.ndarray, limit: float
 def build_capture(
     viewer: SurfaceViewer,
     precomputed: PrecomputedTransfer,
-    pictures: Iterable[Picture],
-    camera_from_head: np.ndarray,
-    intrinsics: np.ndarray,
+    views: Views,
     moves: str,
-    fitted: np.ndarray,
-    allowed: np.ndarray,
     skin: np.ndarray,
     count: int,
-    progress: Callable = iter,
-    light_index: np.ndarray | None = None,
+    context: RunContext,
 ) -> Capture:
-    """Samples and transfer of at most count vertices in F frames.
+    """Samples and transfer of at most count vertices in all views.
 
-    pictures: the F frames in order; camera_from_head [F, 4, 4]; intrinsics [3, 3], or [F, 3, 3] of each; fitted [F];
-    allowed, skin [V] bool: vertices that may be chosen, and where the prior on skin reflectance applies; light_index
-    [F]: each frame's light, None: there is one. Vertices seen in fewer than MINIMUM_FRAMES fitted frames
-    or deep inside the mesh are left out.
+    moves: what moves against the light, which is not the views' where the light goes along; skin [V] bool: vertices
+    that may be chosen, to all of which the prior on skin reflectance applies. Vertices seen in fewer than
+    MINIMUM_FRAMES fitted frames or deep inside the mesh are left out.
     """
-    front = allowed & face_front(viewer, camera_from_head, 0.2)
+    front = skin & face_front(viewer, views.camera_from_head, 0.2)
     index = spread_vertices(viewer.layout, count, front)
-    samples = sample_points_in_frames(viewer, index, pictures, camera_from_head, intrinsics)
+    pictures = read_ahead(map(views.picture, context.progress(range(len(views)), "sampling the pictures")))
+    samples = sample_points_in_frames(viewer, index, pictures, views.camera_from_head, views.intrinsics)
     # Of very few frames, chosen to cover the face, no point is seen in all.
-    least = min(MINIMUM_FRAMES, -(-2 * int(fitted.sum()) // 3))
-    seen = (samples.weight[:, fitted] > 0).sum(1) >= least
+    least = min(MINIMUM_FRAMES, -(-2 * int(views.fitted.sum()) // 3))
+    seen = (samples.weight[:, views.fitted] > 0).sum(1) >= least
     points = mesh_points(viewer.mesh, index[seen])
-    transfer = precomputed.trace(points, progress)
+    transfer = precomputed.trace(points, lambda batches: context.progress(batches, "tracing visibility"))
     shallow = np.nonzero(transfer.blocked < DEEP)[0]
     chosen = np.nonzero(seen)[0][shallow]
     return Capture(
@@ -96,8 +93,8 @@ def build_capture(
         nodes=precomputed.nodes,
         node_transfer=precomputed.node_transfer,
         directions=precomputed.directions,
-        world_from_head=world_from_head(camera_from_head, moves),
-        fitted=fitted,
-        skin=skin[index[chosen]],
-        light_index=light_index,
+        world_from_head=world_from_head(views.camera_from_head, moves),
+        fitted=views.fitted,
+        skin=np.ones(len(chosen), bool),
+        light_index=views.light_index,
     )

@@ -22,10 +22,12 @@ from shared.appearance.texture import (
     weigh_lights,
 )
 from shared.compute.read_ahead import read_ahead
+from shared.compute.run_context import SILENT, RunContext
 from shared.compute.threads import share_out
-from shared.imaging.frame_index import frames_of_lights, spread_frames
-from shared.imaging.image_sampling import Picture, SurfaceViewer, is_inactive
+from shared.imaging.frame_index import spread_frames
+from shared.imaging.image_sampling import SurfaceViewer, is_inactive
 from shared.imaging.texels import FrameView, TexelSamples, TexelSurface, smooth_field
+from shared.imaging.views import Views
 from shared.rendering.shading import VertexShading
 
 Result = TypeVar("Result")
@@ -35,18 +37,6 @@ NEIGHBOUR_STEP, SURROUNDINGS_SPREAD = 0.05, 3.0
 """Standard deviations of the log albedo: from one vertex to the next, and from the person's typical skin."""
 FIRST_PASS_FRAMES = 32
 """Enough to tell what a texel looks like, so that every frame's samples can be weighed by it."""
-
-
-@dataclass(frozen=True)
-class Clip:
-    """The frames as the pass reads them: picture(f) for f in range(F), poses [F, 4, 4], intrinsics of the pictures,
-    [3, 3] or [F, 3, 3], fitted [F] bool; the others are held out; light_index [F]: each frame's light, None: one."""
-
-    picture: Callable[[int], Picture]
-    camera_from_head: np.ndarray
-    intrinsics: np.ndarray
-    fitted: np.ndarray
-    light_index: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -78,23 +68,21 @@ class TexturePass:
         surface: TexelSurface,
         viewer: SurfaceViewer,
         shading: VertexShading,
-        clip: Clip,
+        views: Views,
         specular: float | np.ndarray,
         typical_albedo: np.ndarray,
         sigma: float = 0.25,
         noise: Noise | None = None,
         light_weights: Sequence[float] = (),
         region: np.ndarray | None = None,
-        progress: Callable = lambda items, label: items,
+        context: RunContext = SILENT,
     ):
-        self.surface, self.viewer, self.shading, self.clip = surface, viewer, shading, clip
+        self.surface, self.viewer, self.shading, self.views = surface, viewer, shading, views
         self.typical_albedo = typical_albedo
-        self.intrinsics = np.broadcast_to(clip.intrinsics, (len(clip.fitted), 3, 3))
-        self.light_index = np.zeros(len(clip.fitted), int) if clip.light_index is None else clip.light_index
-        lights = frames_of_lights(self.light_index, len(clip.fitted))
+        lights = views.frames_of_lights
         self.light_weights = tuple(light_weights) or (1.0,) * len(lights)
         self.systematic = [self._systematic(own) / trust for own, trust in zip(lights, self.light_weights, strict=True)]
-        self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), progress
+        self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), context.progress
         self.region = region
 
     def _systematic(self, frames: np.ndarray) -> np.ndarray:
@@ -108,8 +96,8 @@ class TexturePass:
         """Both passes -> the material, and a record of what the held-out frames said to each pooling width."""
         count = len(self.surface)
         mean = np.full(count, self.specular, np.float32)
-        fitted = np.nonzero(self.clip.fitted)[0]
-        some = fitted[spread_frames(len(fitted), FIRST_PASS_FRAMES, self.light_index[fitted])]
+        fitted = np.nonzero(self.views.fitted)[0]
+        some = fitted[spread_frames(len(fitted), FIRST_PASS_FRAMES, self.views.light_index[fitted])]
         (first,) = self._close(self._accumulate(None, some, "texture, first pass"), [mean])
         evidence = self._accumulate(first, fitted, "texture, second pass")
         pooled = [
@@ -128,7 +116,7 @@ class TexturePass:
         borders = [BorderSums(len(self.surface), self.viewer.error_mm) for _ in self.systematic]
         ahead = read_ahead(map(self.view, self.progress(frames, label)))
         for f, view in zip(frames, ahead, strict=True):
-            part, border = parts[self.light_index[f]], borders[self.light_index[f]]
+            part, border = parts[self.views.light_index[f]], borders[self.views.light_index[f]]
             self._share_out(view, lambda lit, part=part, border=border: self._add(material, part, border, lit))
         for part, trust in zip(parts, self.light_weights, strict=True):
             part.scale(trust)
@@ -139,8 +127,8 @@ class TexturePass:
 
     def view(self, f: int) -> FrameView:
         """One frame with the values that LitSamples takes."""
-        clip, shading = self.clip, self.shading
-        pose, picture, lens = clip.camera_from_head[f], clip.picture(f), self.intrinsics[f]
+        views, shading = self.views, self.shading
+        pose, picture, lens = views.camera_from_head[f], views.picture(f), views.intrinsics[f]
         view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
         shadow = shading.shadow_uncertainty(f) * self.typical_albedo.astype(np.float32)
         values = np.concatenate([shading.irradiance(f), shading.reflection(f), shadow], axis=1)
@@ -217,7 +205,7 @@ class TexturePass:
     def held_out_errors(self, candidates: list[TexelMaterial]) -> list[float]:
         """Root mean square residual of each candidate on the held-out frames (linear, censored, trust-weighted)."""
         sums = np.zeros(1 + len(candidates))
-        frames = self.progress(np.nonzero(~self.clip.fitted)[0], "texture, held-out frames")
+        frames = self.progress(np.nonzero(~self.views.fitted)[0], "texture, held-out frames")
         for view in read_ahead(map(self.view, frames)):
             sums += sum(self._share_out(view, lambda lit: _squared_errors(candidates, lit)))
         return [float(value) for value in np.sqrt(sums[1:] / max(3.0 * sums[0], 1e-9))]

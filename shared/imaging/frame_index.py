@@ -1,4 +1,4 @@
-"""Which of a clip's frames: those of each light, some spread evenly, those held out; and their lenses."""
+"""Which of a clip's frames: those of each light, some spread evenly, those held out."""
 
 from __future__ import annotations
 
@@ -27,8 +27,3 @@ def hold_out(count: int, every: int, light_index: np.ndarray | None = None) -> n
         if len(own) > every:
             fitted[own[every // 2 :: every]] = False
     return fitted
-
-
-def lens_of_frames(intrinsics: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """Intrinsics [3, 3] of all frames as they are, of [F, 3, 3] those of some frames."""
-    return intrinsics if intrinsics.ndim == 2 else intrinsics[frames]

@@ -10,8 +10,10 @@ import numpy as np
 from shared.capture.chart import ChartObservation
 from shared.errors import InputError
 from shared.geometry.mesh import Mesh
+from shared.geometry.surface import Surface, TrackPoints
 from shared.imaging.color import decode_transfer
 from shared.imaging.image_sampling import Picture, prepare_picture
+from shared.imaging.views import Views
 from shared.inverse.texture_match import ClipTexture
 from shared.io.arrays import load_arrays, read_json
 from shared.io.frames import FrameSet
@@ -19,47 +21,24 @@ from shared.io.images import read_exr
 from shared.io.meshes import load_mesh, read_obj
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ClipInputs:
-    """F frames with poses: camera_from_head [F, 4, 4]; intrinsics [3, 3] and size (width, height) of the pictures;
-    moves: "head" or "camera"; face_segment [faces] index into segment_names, or None where the mesh has none.
+    """A clip's views and surface; frames: its sampled frames on disk, place [F]: where among them each view is."""
 
-    place [F]: each frame's place in frames; tracks: points [N, 3] on the skin and their errors [N] in depth, mm, where
-    mesh and poses are the tracked ones.
-    """
-
-    mesh: Mesh
-    camera_from_head: np.ndarray
-    intrinsics: np.ndarray
-    size: tuple[int, int]
-    moves: str
+    views: Views
+    surface: Surface
     frames: FrameSet
     place: np.ndarray
-    face_segment: np.ndarray | None
-    segment_names: tuple[str, ...]
-    tracks: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def frame_index(self) -> np.ndarray:
-        """[F] int64: the frames' numbers in the source."""
+        """[F] int64: the views' frame numbers in the source."""
         return self.frames.frame_index[self.place].astype(np.int64)
 
     @property
-    def light_index(self) -> np.ndarray:
-        """[F]: all frames stand in one light."""
-        return np.zeros(len(self.camera_from_head), int)
-
-    def picture(self, f: int) -> Picture:
-        """Frame f, decoded and ready for sampling."""
-        i = int(self.place[f])
-        codes = self.frames.read_codes(i)
-        steps = np.iinfo(codes.dtype).max
-        table = decode_transfer(np.arange(steps + 1) / steps, self.frames.transfer)
-        return prepare_picture(codes, table[codes], self.mask(f))
-
-    def mask(self, f: int) -> np.ndarray:
-        """Frame f's mask [H, W] uint8, 0: background."""
-        return self.frames.read_mask(int(self.place[f]))
+    def lens(self) -> np.ndarray:
+        """[3, 3] px: the one of all views."""
+        return self.frames.intrinsics
 
     def chart_observations(self) -> tuple[ChartObservation, ...]:
         """The colour chart in the frames where one was found."""
@@ -87,9 +66,25 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
     names = tuple(read_json(tracked / "tracking.json")["segments"])
     poses = load_arrays(Path(pose_path)) if pose_path else tracked_poses
     points = None if mesh_path or pose_path else load_arrays(tracked / "tracks.npz")
-    tracks = None if points is None else (points["points_head"], points["sigma_mm"])
-    pose, place = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
-    return ClipInputs(mesh, pose, frames.intrinsics, frames.size, frames.moves, frames, place, segment, names, tracks)
+    tracks = None if points is None else TrackPoints.tracked(points["points_head"], points["sigma_mm"])
+    camera_from_head, place = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
+    views = Views.in_one_light(
+        camera_from_head=camera_from_head,
+        lens=frames.intrinsics,
+        size=frames.size,
+        moves=frames.moves,
+        read_picture=lambda f: read_picture(frames, int(place[f])),
+        read_mask=lambda f: frames.read_mask(int(place[f])),
+    )
+    return ClipInputs(views, Surface(mesh, segment, names, tracks), frames, place)
+
+
+def read_picture(frames: FrameSet, i: int) -> Picture:
+    """Frame i of a frame set, decoded and ready for sampling."""
+    codes = frames.read_codes(i)
+    steps = np.iinfo(codes.dtype).max
+    table = decode_transfer(np.arange(steps + 1) / steps, frames.transfer)
+    return prepare_picture(codes, table[codes], frames.read_mask(i))
 
 
 def read_mean_texture(folder: Path, mesh: Mesh) -> ClipTexture:

@@ -6,25 +6,19 @@ import numpy as np
 
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
+from shared.imaging.views import Views
 
 CANDIDATES = 60
 
 
-def covering_frames(
-    viewer: SurfaceViewer,
-    wanted: np.ndarray,
-    camera_from_head: np.ndarray,
-    intrinsics: np.ndarray,
-    size: tuple[int, int],
-    count: int,
-) -> np.ndarray:
-    """[count] indices into the poses [F, 4, 4]: greedily those that add most to the best view of each vertex.
+def covering_frames(viewer: SurfaceViewer, wanted: np.ndarray, views: Views, count: int) -> np.ndarray:
+    """[count] indices into the views: greedily those that add most to the best view of each vertex.
 
     wanted [V] bool: vertices that count, each by the square of its view cosine where it is seen.
     """
-    candidates = spread_frames(len(camera_from_head), CANDIDATES)
-    views = [viewer.view(camera_from_head[f], intrinsics, size).weight[wanted] for f in candidates]
-    weight, best, chosen = np.stack(views), np.zeros(int(wanted.sum()), np.float32), []
+    candidates = spread_frames(len(views), CANDIDATES)
+    seen = [viewer.view(views.camera_from_head[f], views.intrinsics[f], views.size).weight[wanted] for f in candidates]
+    weight, best, chosen = np.stack(seen), np.zeros(int(wanted.sum()), np.float32), []
     for _ in range(min(count, len(candidates))):
         gain = np.maximum(weight, best).sum(1)
         gain[chosen] = -1.0

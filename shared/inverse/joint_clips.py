@@ -16,7 +16,8 @@ import numpy as np
 
 from shared.capture.chart import ChartObservation
 from shared.errors import InputError
-from shared.geometry.mesh import Mesh, normalised
+from shared.geometry.mesh import normalised
+from shared.geometry.surface import Surface
 from shared.geometry.transforms import (
     Similarity,
     camera_centres,
@@ -25,9 +26,9 @@ from shared.geometry.transforms import (
     rotation_from_vector,
     similarity_from_points,
 )
-from shared.imaging.image_sampling import Picture
+from shared.imaging.views import Views
+from shared.inverse.clip_inputs import ClipInputs
 from shared.inverse.texture_match import ClipTexture, Matches, match_textures
-from shared.shape.refine import track_points
 
 MATCHES, LEAST_MATCHES = 2000, 300
 """Texels that a pose is solved from, and fewer than which show that the clips have no skin in common."""
@@ -36,84 +37,65 @@ FACING = 0.4
 LOSS_PX, ITERATIONS = 1.0, 30
 
 
-@dataclass(frozen=True)
-class JointInputs:
-    """What the solver needs of several clips (see InverseInputs): the frames of each in a row.
+@dataclass(frozen=True, eq=False)
+class JoinedClips:
+    """Several clips as one: the views of each in a row on one surface.
 
-    clips: as they are on disk; main: which of them the mesh comes from; matched [C]: texels by which each other clip
-    was placed, and match_px [C]: median distance of these from where the clip's own mesh put them.
+    clips: as they are on disk; main: which of them the mesh comes from; placed: how each one's views were placed on it.
     """
 
-    clips: tuple
+    views: Views
+    surface: Surface
+    clips: tuple[ClipInputs, ...]
     main: int
-    mesh: Mesh
-    camera_from_head: np.ndarray
-    intrinsics: np.ndarray
-    size: tuple[int, int]
-    moves: str
-    face_segment: np.ndarray | None
-    segment_names: tuple[str, ...]
-    tracks: tuple[np.ndarray, np.ndarray] | None
-    light_index: np.ndarray
-    matched: tuple[int, ...]
-    match_px: tuple[float, ...]
-
-    def picture(self, f: int) -> Picture:
-        """Frame f of all."""
-        clip = int(self.light_index[f])
-        return self.clips[clip].picture(f - self._first(clip))
-
-    def mask(self, f: int) -> np.ndarray:
-        """Its mask [H, W], 0: background."""
-        clip = int(self.light_index[f])
-        return self.clips[clip].mask(f - self._first(clip))
-
-    def _first(self, clip: int) -> int:
-        return int(np.searchsorted(self.light_index, clip))
+    placed: tuple[Placed, ...]
 
     def chart_observations(self) -> tuple[ChartObservation, ...]:
         """The colour chart of the first clip that shows one: one clip's scale is that of all."""
-        for k, clip in enumerate(self.clips):
+        for own, clip in zip(self.views.frames_of_lights, self.clips, strict=True):
             if observations := clip.chart_observations():
-                return tuple(replace(observation,
-                                     frame=observation.frame + self._first(k)) for observation in observations)
+                return tuple(replace(seen, frame=seen.frame + int(own[0])) for seen in observations)
         return ()
 
     def describe(self) -> list[dict]:
         """Of each clip what solve.json says: whether the mesh is its own, else how its frames were placed on it."""
-        facts = zip(self.matched, self.match_px, strict=True)
-        return [{"mesh": True} if k == self.main else {"mesh": False, "matched_texels": count, "match_px": round(px, 4)}
-                for k, (count, px) in enumerate(facts)]
+        return [{"mesh": True} if k == self.main else
+                {"mesh": False, "matched_texels": own.matched, "match_px": round(own.match_px, 4)}
+                for k, own in enumerate(self.placed)]
 
 
-def join_clips(clips: Sequence, textures: Sequence[ClipTexture]) -> JointInputs:
-    """Clips (shared.inverse.clip_inputs.ClipInputs) in the head space of the one that knows depth best; textures:
-    theirs.
+def join_clips(clips: Sequence[ClipInputs], textures: Sequence[ClipTexture]) -> JoinedClips:
+    """Clips in the head space of the one that knows depth best; textures: theirs.
 
     Clips without tracks, whose mesh and poses were given, share a head space already. InputError where the clips show
     no common skin.
     """
-    main, placed = 0, [Placed(clip.camera_from_head) for clip in clips]
-    if all(clip.tracks is not None for clip in clips):
-        main = int(np.argmin([depth_deviation(clip) for clip in clips]))
+    main, placed = 0, [Placed(clip.views.camera_from_head) for clip in clips]
+    tracks = [clip.surface.tracks for clip in clips]
+    if all(own is not None for own in tracks):
+        main = int(np.argmin([np.median(own.sigma_mm) for own in tracks]))
         for k, clip in enumerate(clips):
             if k != main:
-                placed[k] = place(clips[main], clip, match_textures(textures[main], textures[k]))
-    counts = [len(clip.camera_from_head) for clip in clips]
-    return JointInputs(
-        tuple(clips),
-        main,
-        clips[main].mesh,
-        np.concatenate([own.camera_from_head for own in placed]),
-        np.repeat([clip.intrinsics for clip in clips], counts, axis=0),
-        clips[0].size,
-        clips[0].moves,
-        clips[main].face_segment,
-        clips[main].segment_names,
-        clips[main].tracks,
-        np.repeat(np.arange(len(clips)), counts),
-        tuple(own.matched for own in placed),
-        tuple(own.match_px for own in placed),
+                matches = match_textures(textures[main], textures[k])
+                placed[k] = place_on_surface(clip.views, matches, clip.frames.source_name)
+    views = join_views([replace(clip.views, camera_from_head=own.camera_from_head)
+                        for clip, own in zip(clips, placed, strict=True)])
+    return JoinedClips(views, clips[main].surface, tuple(clips), main, tuple(placed))
+
+
+def join_views(parts: Sequence[Views]) -> Views:
+    """The views of several clips, of one head space and picture size, in a row, those of each in a light of its own."""
+    counts = [len(part) for part in parts]
+    owner, first = np.repeat(np.arange(len(parts)), counts), np.cumsum([0, *counts])
+    return Views(
+        camera_from_head=np.concatenate([part.camera_from_head for part in parts]),
+        intrinsics=np.concatenate([part.intrinsics for part in parts]),
+        size=parts[0].size,
+        moves=parts[0].moves,
+        light_index=owner,
+        fitted=np.concatenate([part.fitted for part in parts]),
+        read_picture=lambda f: parts[owner[f]].picture(f - first[owner[f]]),
+        read_mask=lambda f: parts[owner[f]].mask(f - first[owner[f]]),
     )
 
 
@@ -147,33 +129,30 @@ def fit_similarity(
     return found
 
 
-def depth_deviation(clip) -> float:
-    """Median standard deviation of a clip's track points in depth, mm."""
-    return float(np.median(track_points(*clip.tracks).sigma_mm))
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Placed:
-    """A clip's poses [F, 4, 4] in the shared head space; matched, match_px: see JointInputs."""
+    """A clip's poses [F, 4, 4] in the shared head space; matched: texels by which they were placed there, and match_px:
+    median distance of these from where the clip's own mesh put them."""
 
     camera_from_head: np.ndarray
     matched: int = 0
     match_px: float = 0.0
 
 
-def place(main, clip, matches: Matches) -> Placed:
-    """The poses of a clip on the main clip's mesh; matches: from the main one's to its own."""
+def place_on_surface(views: Views, matches: Matches, name: str) -> Placed:
+    """The poses of a clip's views on another clip's surface; matches: from that one to the clip's own; name: of the
+    clip, for messages."""
     if len(matches) < LEAST_MATCHES:
-        raise InputError("the clips do not show the same skin", where=clip.frames.source_name,
+        raise InputError("the clips do not show the same skin", where=name,
                          got=f"{len(matches)} texels alike", expected=f"{LEAST_MATCHES} or more",
                          hint="film one face, the same in all clips and sharp, or solve each clip by itself")
-    chosen, poses = matches.thinned(MATCHES), clip.camera_from_head
-    pixels = project(chosen.second, poses, clip.intrinsics)[0]
+    chosen, poses, lens = matches.thinned(MATCHES), views.camera_from_head, views.intrinsics[0]
+    pixels = project(chosen.second, poses, lens)[0]
     towards = normalised(camera_centres(poses)[:, None] - chosen.second)
     pixels[(towards * chosen.normals).sum(-1) < FACING] = np.nan
     start = Similarity(*similarity_from_points(chosen.first, chosen.second))
-    own = fit_similarity(chosen.first, pixels, poses, clip.intrinsics, start)
+    own = fit_similarity(chosen.first, pixels, poses, lens, start)
     back = Similarity(1.0 / own.scale, own.rotation.T, -own.rotation.T @ own.translation / own.scale)
     found = back.pose(poses)
-    away = np.linalg.norm(project(chosen.first, found, clip.intrinsics)[0] - pixels, axis=-1)
+    away = np.linalg.norm(project(chosen.first, found, lens)[0] - pixels, axis=-1)
     return Placed(found, len(matches), float(np.nanmedian(away)))

@@ -7,19 +7,21 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
+from shared.appearance.chart_scale import ChartStatement
 from shared.appearance.fit import Solution
-from shared.appearance.observations import Capture
+from shared.appearance.observations import Capture, build_capture
+from shared.compute.run_context import RunContext
 from shared.geometry.mesh import segments_at
+from shared.geometry.surface import Surface
 from shared.imaging.frame_index import hold_out, spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
-from shared.inverse.problem import InverseInputs, InverseSettings, capture_skin, frames_of
+from shared.imaging.views import Views
+from shared.inverse.problem import FACE_SKIN, InverseSettings, some_views
 from shared.rendering.precomputed_transfer import Sizes, precompute_transfer
 from shared.selection.candidates import FEWEST_HELD_OUT, ModelSelection, allowed_candidates, describe, serves
 from shared.selection.specular import POOLING, VARIATIONS, SpecularSelection, SpecularVariation
 from shared.shape.gauss_newton import Reflectance, ShapeSettings
-from shared.shape.refine import refine_shape
+from shared.shape.refine import RefinedSurface, refine_shape
 
 SELECTION_SIZES = Sizes(points=600, directions=768, nodes=200)
 SELECTION_FRAMES, SELECTION_HOLD_OUT = 36, 3
@@ -29,11 +31,10 @@ anyway."""
 
 @dataclass(frozen=True)
 class SelectedModel:
-    """The clip with the mesh that was chosen, what is left to solve, a solution to start from, how its
-    specular terms vary,
-    what became of the mesh, and the record of the candidates."""
+    """The surface with the mesh that was chosen, what is left to solve, a solution to start from, how its specular
+    terms vary, what became of the mesh, and the record of the candidates."""
 
-    inputs: InverseInputs
+    surface: Surface
     settings: InverseSettings
     start: Solution | None = None
     variation: SpecularVariation | None = None
@@ -54,16 +55,25 @@ class Made(dict):
 
 
 class SmallClip:
-    """A clip's captures with few points, frames and directions, from one mesh: with visibility (True) and without."""
+    """Captures of a surface with few points, views and directions: with visibility (True) and without; refined: how the
+    surface was made, None: it is the tracked one."""
 
-    def __init__(self, inputs: InverseInputs, settings: InverseSettings, fitted: np.ndarray, chart, progress: Callable):
-        self.inputs, full = inputs, settings.sizes
+    def __init__(
+        self,
+        views: Views,
+        surface: Surface,
+        settings: InverseSettings,
+        chart: ChartStatement | None,
+        context: RunContext,
+        refined: RefinedSurface | None = None,
+    ):
+        self.surface, self.refined, full = surface, refined, settings.sizes
         self.sizes = Sizes(**{name: min(getattr(full, name), most) for name, most in vars(SELECTION_SIZES).items()})
-        viewer = SurfaceViewer.of(inputs.mesh)
+        viewer = SurfaceViewer.of(surface.mesh)
         self.precomputed = Made(lambda visibility: precompute_transfer(viewer, self.sizes, visibility))
-        frames = selection_frames(inputs, settings, fitted)
-        moves, count = settings.appearance.light_moves(inputs.moves), self.sizes.points
-        seen = capture_skin(inputs, viewer, self.precomputed[True], frames, moves, count, progress)
+        moves, skin = settings.appearance.light_moves(views.moves), surface.vertices_of(FACE_SKIN)
+        few = selection_views(views, settings)
+        seen = build_capture(viewer, self.precomputed[True], few, moves, skin, self.sizes.points, context)
         self.captures = Made(self._without_visibility)
         self.captures[True] = replace(seen, chart=chart)
 
@@ -72,25 +82,25 @@ class SmallClip:
         return replace(seen, transfer=bare.trace(seen.points), node_transfer=bare.node_transfer)
 
 
-def selection_frames(
-    inputs: InverseInputs, settings: InverseSettings, fitted: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Frames that model selection looks at, and which of them are fitted: none that is held out of the whole solve."""
+def selection_views(views: Views, settings: InverseSettings) -> Views:
+    """Views that model selection looks at; none is fitted that is held out of the whole solve."""
     if settings.fit_frames:
-        return frames_of(inputs, settings, SELECTION_FRAMES, fitted)
-    lights = inputs.light_index
-    chosen = spread_frames(len(fitted), SELECTION_FRAMES, lights)
-    return chosen, fitted[chosen] & hold_out(len(chosen), SELECTION_HOLD_OUT, lights[chosen])
+        return some_views(views, settings, SELECTION_FRAMES)
+    chosen = spread_frames(len(views), SELECTION_FRAMES, views.light_index)
+    judging = hold_out(len(chosen), SELECTION_HOLD_OUT, views.light_index[chosen])
+    return views.take(chosen, views.fitted[chosen] & judging)
 
 
 def select(
-    inputs: InverseInputs, settings: InverseSettings, fitted: np.ndarray, chart, progress: Callable, note: Callable
+    views: Views, surface: Surface, settings: InverseSettings, chart: ChartStatement | None, context: RunContext
 ) -> SelectedModel:
-    """Chooses the model of a clip. fitted [F] bool; chart: what a colour chart says of the light, or None."""
-    selector = _ClipSelection(inputs, settings, fitted, chart, progress, note)
+    """Chooses the model of a clip; chart: what a colour chart says of the light, or None."""
+    selector = _ClipSelection(views, surface, settings, chart, context)
     if selector.held_out < FEWEST_HELD_OUT:
-        note(f"the model is not chosen: {selector.held_out} frames are too few to judge it by; all of it is solved")
-        return SelectedModel(inputs, replace(settings, selection=None))
+        context.note(
+            f"the model is not chosen: {selector.held_out} frames are too few to judge it by; all of it is solved"
+        )
+        return SelectedModel(surface, replace(settings, selection=None))
     selector.select()
     return selector.selected()
 
@@ -98,11 +108,17 @@ def select(
 class _ClipSelection:
     """Appearance on the tracked mesh, then the mesh, then the appearance again where the mesh changed."""
 
-    def __init__(self, inputs, settings: InverseSettings, fitted: np.ndarray, chart, progress, note):
-        self.settings, self.fitted, self.chart = settings, fitted, chart
-        self.progress, self.note, self.candidates = progress, note, []
-        self.forced = settings.selection
-        self.tracked = self.small = SmallClip(inputs, settings, fitted, chart, progress)
+    def __init__(
+        self,
+        views: Views,
+        surface: Surface,
+        settings: InverseSettings,
+        chart: ChartStatement | None,
+        context: RunContext,
+    ):
+        self.views, self.settings, self.chart, self.context = views, settings, chart, context
+        self.candidates, self.forced = [], settings.selection
+        self.tracked = self.small = SmallClip(views, surface, settings, chart, context)
         self.held_out = int((~self.small.captures[True].fitted).sum())
         self.selection = self._selection(self.small)
         self.shape_record: dict = {"refined": False}
@@ -111,7 +127,7 @@ class _ClipSelection:
     def select(self) -> None:
         """All parts; the result stands in small, selection.present and variation."""
         self.selection.select()
-        if self.settings.shape is not None and self.small.inputs.face_segment is not None:
+        if self.settings.shape is not None and self.small.surface.face_segment is not None:
             self._select_geometry(self.settings.shape)
         if self.selection.present.model.specular != "none":
             self._select_specular()
@@ -124,14 +140,14 @@ class _ClipSelection:
         if self.small is not self.tracked:
             after = self.selection.present
             residuals = {"before": float(before.errors.mean()), "after": float(after.errors.mean())}
-            stopped = self.small.inputs.stopped
+            stopped = self.small.refined.stopped
             self.shape_record = {"refined": True, "held_out": residuals, "stopped_vertices": stopped}
             self.selection.select()
 
     def _select_specular(self) -> None:
-        present, inputs, settings = self.selection.present, self.small.inputs, self.settings.appearance
+        present, surface, settings = self.selection.present, self.small.surface, self.settings.appearance
         capture = self.small.captures[present.model.visibility != "off"]
-        segment = segments_at(inputs.mesh, inputs.face_segment, capture.points.positions)
+        segment = segments_at(surface.mesh, surface.face_segment, capture.points.positions)
         free = {"specular": True, "roughness": settings.local_roughness}
         candidates = {part: VARIATIONS[: 3 if free[part] and part not in self.forced else 1] for part in free}
         applied = present.model.applied(settings)
@@ -140,15 +156,19 @@ class _ClipSelection:
     def _refine(self, shape: ShapeSettings) -> bool:
         """Refines the tracked mesh, or goes on refining it, under the present solution; kept where that serves."""
         start = time.perf_counter()
-        below, tracked, below_is_tracked = self.selection.present, self.tracked.inputs, self.small is self.tracked
+        below = self.selection.present
         appearance = below.model.applied(self.settings.appearance)
-        known = Reflectance.of(below.solution, self.small.precomputed[appearance.visibility])
-        frames = frames_of(tracked, self.settings, shape.frames, self.fitted)
         refined = refine_shape(
-            tracked, frames, reflectance=known, appearance=appearance, sizes=self.small.sizes, settings=shape,
-            progress=self.progress, note=self.note, begun=None if below_is_tracked else self.small.inputs,
+            some_views(self.views, self.settings, shape.frames),
+            self.tracked.surface,
+            reflectance=Reflectance.of(below.solution, self.small.precomputed[appearance.visibility]),
+            appearance=appearance,
+            sizes=self.small.sizes,
+            settings=shape,
+            context=self.context,
+            begun=self.small.refined,
         )
-        small = SmallClip(refined, self.settings, self.fitted, self.chart, self.progress)
+        small = SmallClip(self.views, refined.surface, self.settings, self.chart, self.context, refined)
         selection = self._selection(small)
         selection.begin(below.model, below.solution)
         trial = replace(selection.present, seconds=time.perf_counter() - start)
@@ -168,7 +188,7 @@ class _ClipSelection:
         fall = "" if record["fall"] is None else f", {-record['fall']:+.6f} +- {record['standard_error']:.6f}"
         said = "accepted" if record["climbed"] else "not accepted"
         text = f"{record['part']} {record['rung']}: {record['held_out']:.6f} held out{fall}"
-        self.note(f"model selection: {text}; {said} ({record['seconds']:.1f} s)")
+        self.context.note(f"model selection: {text}; {said} ({record['seconds']:.1f} s)")
 
     def selected(self) -> SelectedModel:
         """What is left to solve."""
@@ -179,7 +199,7 @@ class _ClipSelection:
         widths = settings.specular_widths if "specular" in forced else POOLING[self.variation.specular]
         settings = replace(settings, appearance=appearance, shape=None, specular_widths=widths)
         return SelectedModel(
-            self.small.inputs, settings, start=present.solution, variation=self.variation,
+            self.small.surface, settings, start=present.solution, variation=self.variation,
             shape_record=self.shape_record,
             candidates=tuple(self.candidates),
         )

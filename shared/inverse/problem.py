@@ -3,53 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
 from shared.appearance.fit import Solution
-from shared.appearance.observations import Capture, build_capture, face_front
+from shared.appearance.observations import face_front
 from shared.appearance.problem import AppearanceSettings
 from shared.appearance.texture import TexelMaterial
-from shared.compute.read_ahead import read_ahead
-from shared.geometry.mesh import Mesh
-from shared.imaging.frame_index import hold_out, lens_of_frames, spread_frames
-from shared.imaging.image_sampling import Picture, SurfaceViewer
+from shared.compute.run_context import RunContext
+from shared.geometry.surface import Surface
+from shared.imaging.frame_index import hold_out, spread_frames
+from shared.imaging.image_sampling import SurfaceViewer
+from shared.imaging.views import Views
 from shared.inverse.frame_choice import covering_frames
 from shared.published.settings import ReferenceSettings
 from shared.rendering.precomputed_transfer import PrecomputedTransfer, Sizes
 from shared.rendering.shading import Material, VertexShading
 from shared.rendering.transfer import mesh_points
 from shared.shape.gauss_newton import ShapeSettings
-from shared.shape.refine import faces_of
 
 FACE_SKIN = ("forehead", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "chin", "jaw")
 """Segments whose skin the light is solved from; hair, brows, lips, lids, eyes and what clothes may cover are left out.
 """
-
-
-class InverseInputs(Protocol):
-    """What the solver needs of a clip or of several; shared.inverse.clip_inputs.ClipInputs is one.
-
-    picture(f): frame f of F ready for sampling; mask(f) [H, W], 0: background; camera_from_head [F, 4, 4]; intrinsics
-    [3, 3], or [F, 3, 3], and size (width, height) of the pictures; moves: "head" or "camera"; face_segment [faces] or
-    None where the mesh has no segments; tracks: points [N, 3] on the skin with their errors [N] in depth, mm, or None;
-    light_index [F]: which light each frame stands in, 0 first, frames of one light in a row.
-    """
-
-    mesh: Mesh
-    camera_from_head: np.ndarray
-    intrinsics: np.ndarray
-    size: tuple[int, int]
-    moves: str
-    face_segment: np.ndarray | None
-    segment_names: tuple[str, ...]
-    tracks: tuple[np.ndarray, np.ndarray] | None
-    light_index: np.ndarray
-
-    def picture(self, f: int) -> Picture: ...
-
-    def mask(self, f: int) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -76,8 +51,8 @@ class InverseSettings:
 
 @dataclass(frozen=True)
 class InverseResult:
-    """solution of the appearance fit, the texels' material, maps by name, the vertices' shading in all frames, the
-    viewer of the final mesh, and what is worth recording."""
+    """solution of the appearance fit, the texels' material, maps by name, the vertices' shading in all views, the
+    viewer of the final mesh, which views were fitted [F] bool, and what is worth recording."""
 
     solution: Solution
     material: TexelMaterial
@@ -88,69 +63,37 @@ class InverseResult:
     record: dict
 
 
-def frames_of(
-    inputs: InverseInputs, settings: InverseSettings, wanted: int, fitted: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """At most wanted frames, evenly spread, and which of them are fitted."""
-    lights = inputs.light_index
-    chosen = spread_frames(len(inputs.camera_from_head), wanted, lights)
+def some_views(views: Views, settings: InverseSettings, wanted: int) -> Views:
+    """At most wanted views, evenly spread; all that are fitted where these are few and chosen."""
+    chosen = spread_frames(len(views), wanted, views.light_index)
     if settings.fit_frames:
-        chosen = np.union1d(chosen, np.nonzero(fitted)[0])
-    if (~fitted[chosen]).sum() >= 2:
-        return chosen, fitted[chosen]
+        chosen = np.union1d(chosen, np.nonzero(views.fitted)[0])
+    if (~views.fitted[chosen]).sum() >= 2:
+        return views.take(chosen)
     # Every part of the solve needs held-out frames too: where thinning left too few, hold out among the thinned.
-    return chosen, hold_out(len(chosen), settings.hold_out_every, lights[chosen])
+    return views.take(chosen, hold_out(len(chosen), settings.hold_out_every, views.light_index[chosen]))
 
 
-def frames_to_fit(inputs: InverseInputs, settings: InverseSettings, viewer: SurfaceViewer) -> np.ndarray:
-    """[F] bool: all frames but those held out, or the few that cover the face."""
-    poses = inputs.camera_from_head
+def frames_to_fit(views: Views, surface: Surface, settings: InverseSettings, viewer: SurfaceViewer) -> np.ndarray:
+    """[F] bool: all frames but those held out, or the few that cover the face. viewer: of the surface's mesh."""
     if not settings.fit_frames:
-        return hold_out(len(poses), settings.hold_out_every, inputs.light_index)
-    skin = segment_vertices(inputs, FACE_SKIN)
-    chosen = covering_frames(viewer, skin, poses, inputs.intrinsics, inputs.size, settings.fit_frames)
-    return np.isin(np.arange(len(poses)), chosen)
-
-
-def segment_vertices(inputs: InverseInputs, names: tuple[str, ...]) -> np.ndarray:
-    """[V] bool: vertices of faces in the named segments; all of them where the mesh has no segments."""
-    if inputs.face_segment is None:
-        return np.ones(len(inputs.mesh.vertices), bool)
-    found = np.zeros(len(inputs.mesh.vertices), bool)
-    found[inputs.mesh.faces[faces_of(inputs, names)]] = True
-    return found
-
-
-def capture_skin(
-    inputs, viewer, precomputed: PrecomputedTransfer, frames: tuple[np.ndarray, np.ndarray], moves: str, count: int,
-    progress
-) -> Capture:
-    """What at most count points of the face's skin show; frames: which, and which of them are fitted."""
-    chosen, fitted = frames
-    skin = segment_vertices(inputs, FACE_SKIN)
-    return build_capture(
-        viewer,
-        precomputed,
-        read_ahead(map(inputs.picture, progress(chosen, "gathering samples"))),
-        inputs.camera_from_head[chosen],
-        lens_of_frames(inputs.intrinsics, chosen),
-        moves,
-        fitted,
-        allowed=skin,
-        skin=skin,
-        count=count,
-        progress=lambda items: progress(items, "tracing visibility"),
-        light_index=inputs.light_index[chosen],
-    )
+        return hold_out(len(views), settings.hold_out_every, views.light_index)
+    chosen = covering_frames(viewer, surface.vertices_of(FACE_SKIN), views, settings.fit_frames)
+    return np.isin(np.arange(len(views)), chosen)
 
 
 def shade_vertices(
-    inputs, appearance: AppearanceSettings, viewer, precomputed: PrecomputedTransfer, solution: Solution, progress
+    views: Views,
+    viewer: SurfaceViewer,
+    precomputed: PrecomputedTransfer,
+    appearance: AppearanceSettings,
+    solution: Solution,
+    context: RunContext,
 ) -> VertexShading:
-    """Shading of all vertices that some frame faces, in all frames."""
-    index = np.nonzero(face_front(viewer, inputs.camera_from_head, -0.1))[0]
+    """Shading of all vertices that some view faces, in all views."""
+    index = np.nonzero(face_front(viewer, views.camera_from_head, -0.1))[0]
     points = mesh_points(viewer.mesh, index)
-    transfer = precomputed.trace(points, lambda batches: progress(batches, "tracing the surface"))
+    transfer = precomputed.trace(points, lambda batches: context.progress(batches, "tracing the surface"))
     state = solution.state
     local = None if solution.local_roughness_fit is None else solution.local_roughness_fit.roughness(points.positions)
     return VertexShading(
@@ -162,8 +105,8 @@ def shade_vertices(
         Material(state.node_albedo, state.specular, state.roughness, local),
         state.light,
         precomputed.directions,
-        inputs.camera_from_head,
-        appearance.light_moves(inputs.moves),
+        views.camera_from_head,
+        appearance.light_moves(views.moves),
         bounce=appearance.bounce,
-        light_index=inputs.light_index,
+        light_index=views.light_index,
     )

@@ -17,14 +17,17 @@ from shared.appearance.light_models import LogLight
 from shared.appearance.maps import make_maps
 from shared.appearance.problem import AppearanceState
 from shared.appearance.texture import TexelMaterial
+from shared.compute.run_context import RunContext
 from shared.errors import InputError
+from shared.geometry.surface import Surface
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import TexelSurface
-from shared.inverse.problem import FACE_SKIN, InverseResult, InverseSettings, segment_vertices, shade_vertices
+from shared.imaging.views import Views
+from shared.inverse.problem import FACE_SKIN, InverseResult, InverseSettings, shade_vertices
 from shared.io.arrays import load_arrays, save_arrays
 from shared.published.settings import ReferenceSettings
-from shared.published.solver import ReferenceSolver, Start, Views
+from shared.published.solver import ReferenceSolver, Start
 from shared.rendering.precomputed_transfer import precompute_transfer
 
 START_FRAMES, JUDGED_FRAMES, JUDGED_PIXELS = 32, 6, 2000
@@ -44,14 +47,15 @@ class Average:
     weight: np.ndarray
 
 
-def average_texture(inputs, viewer: SurfaceViewer, size: int, frames: np.ndarray, progress: Callable) -> Average:
-    """Weighted mean of what some frames show of each texel; unseen texels take the median colour."""
+def average_texture(views: Views, viewer: SurfaceViewer, size: int, context: RunContext) -> Average:
+    """Weighted mean of what the views show of each texel of a map of that edge; unseen texels take the median colour.
+    """
     surface = TexelSurface(viewer.mesh, size)
     total, weight = np.zeros((len(surface), 3)), np.zeros(len(surface))
-    for f in progress(frames, "mean texture"):
-        picture = inputs.picture(f)
-        view = viewer.view(inputs.camera_from_head[f], inputs.intrinsics, picture.inside.shape[::-1])
-        samples, _ = surface.samples(surface.frame_view(view, picture, inputs.intrinsics))
+    for f in context.progress(range(len(views)), "mean texture"):
+        picture, lens = views.picture(f), views.intrinsics[f]
+        view = viewer.view(views.camera_from_head[f], lens, picture.inside.shape[::-1])
+        samples, _ = surface.samples(surface.frame_view(view, picture, lens))
         total[samples.rows] += samples.weight[:, None] * samples.colours
         weight[samples.rows] += samples.weight
     seen = weight > 1e-3
@@ -79,39 +83,35 @@ def make_start(average: Average, skin: np.ndarray, white_sigma: float, specular:
 
 
 def solve_by_reference(
-    inputs,
+    views: Views,
+    surface: Surface,
     settings: InverseSettings,
     reference: ReferenceSettings,
-    fitted: np.ndarray,
-    progress: Callable,
-    note: Callable,
+    context: RunContext,
     observe: Callable[[ReferenceSolver, dict], None] = lambda solver, record: None,
 ) -> InverseResult:
-    """As inverse.solve_clip. fitted [F] bool; observe(solver, losses) after each iteration."""
-    mesh = inputs.mesh
-    viewer = SurfaceViewer.of(mesh)
-    index = np.nonzero(fitted)[0]
-    some = index[spread_frames(len(index), START_FRAMES)]
-    average = average_texture(inputs, viewer, settings.map_size, some, progress)
-    skin = segment_vertices(inputs, FACE_SKIN)
+    """As inverse.solve_clip, of the views that are fitted; observe(solver, losses) after each iteration."""
+    viewer = SurfaceViewer.of(surface.mesh)
+    index = np.nonzero(views.fitted)[0]
+    fitted = views.take(index)
+    some = views.take(index[spread_frames(len(index), START_FRAMES)])
+    average = average_texture(some, viewer, settings.map_size, context)
+    skin = surface.vertices_of(FACE_SKIN)
     start = make_start(average, skin, settings.appearance.white_sigma, reference.sampling.specular)
-    moves = settings.appearance.light_moves(inputs.moves)
-    views = Views(
-        lambda k: inputs.picture(int(index[k])), inputs.camera_from_head[index], inputs.intrinsics, inputs.size, moves
-    )
-    solver = ReferenceSolver(mesh, views, start, reference)
-    checkpoint = Checkpoint(reference, start, views)
-    checkpoint.load(solver, note)
+    moving = replace(fitted, moves=settings.appearance.light_moves(views.moves))
+    solver = ReferenceSolver(surface.mesh, moving, start, reference)
+    checkpoint = Checkpoint(reference, start, moving)
+    checkpoint.load(solver, context.note)
     records = []
-    for i in progress(range(solver.iteration, reference.iterations), "reference iterations"):
+    for i in context.progress(range(solver.iteration, reference.iterations), "reference iterations"):
         losses = solver.step()
         observe(solver, losses)
         records.append(losses)
         if (i + 1) % REPORT_EVERY == 0 or i + 1 == reference.iterations:
             mean = {name: float(np.mean([r[name] for r in records[-REPORT_EVERY:]])) for name in losses}
-            note(f"iteration {i + 1}: " + ", ".join(f"{name} {value:.5f}" for name, value in mean.items()))
+            context.note(f"iteration {i + 1}: " + ", ".join(f"{name} {value:.5f}" for name, value in mean.items()))
         checkpoint.save(solver)
-    result = conclude(inputs, settings, solver, average, fitted, records, progress)
+    result = conclude(views, surface, settings, solver, average, records, context)
     checkpoint.remove()
     return result
 
@@ -156,29 +156,36 @@ class Checkpoint:
             Path(self.path).unlink(missing_ok=True)
 
 
-def conclude(inputs, settings, solver: ReferenceSolver, average: Average, fitted, records, progress) -> InverseResult:
+def conclude(
+    views: Views,
+    surface: Surface,
+    settings: InverseSettings,
+    solver: ReferenceSolver,
+    average: Average,
+    records: list[dict],
+    context: RunContext,
+) -> InverseResult:
     """The solver's state as maps, light and shading, for re-rendering by the shared renderer."""
-    surface, material = average.surface, map_material(solver, average)
-    moved = inputs.mesh.replace(vertices=solver.vertices().detach().cpu().double().numpy())
-    viewer = SurfaceViewer.of(moved)
+    texels, material = average.surface, map_material(solver, average)
+    viewer = SurfaceViewer.of(surface.mesh.replace(vertices=solver.vertices().detach().cpu().double().numpy()))
     roughness_map = solver.parameters["roughness"].detach().cpu().numpy()
     skin = average.weight > 1e-3
-    roughness = float(np.median(roughness_map.reshape(-1)[surface.pixel][skin]))
-    maps = make_maps(surface, material, roughness)
+    roughness = float(np.median(roughness_map.reshape(-1)[texels.pixel][skin]))
+    maps = make_maps(texels, material, roughness)
     maps["roughness"] = roughness_map.astype(np.float32)
     appearance = replace(settings.appearance, bounce=False, visibility=solver.settings.sampling.visibility)
     precomputed = precompute_transfer(viewer, settings.sizes, appearance.visibility)
     state = final_state(solver, material, roughness, len(precomputed.nodes.points))
-    fit = residual(inputs, solver, np.nonzero(fitted)[0])
-    held = fit if fitted.all() else residual(inputs, solver, np.nonzero(~fitted)[0])
+    fit = residual(views, solver, np.nonzero(views.fitted)[0])
+    held = fit if views.fitted.all() else residual(views, solver, np.nonzero(~views.fitted)[0])
     solution = Solution(state, tuple(_thinned(records)), fit, held)
-    shading = shade_vertices(inputs, appearance, viewer, precomputed, solution, progress)
+    shading = shade_vertices(views, viewer, precomputed, appearance, solution, context)
     record = {
         "texture": {"held_out": {"per texel": held}, "chosen": "per texel"},
         "albedo_scale": describe_scale(None, np.median(state.albedo, axis=0)) | {"method": SCALE},
         "warnings": [],
     }
-    return InverseResult(solution, material, maps, shading, viewer, fitted, record)
+    return InverseResult(solution, material, maps, shading, viewer, views.fitted, record)
 
 
 def map_material(solver: ReferenceSolver, average: Average) -> TexelMaterial:
@@ -203,11 +210,11 @@ def final_state(solver: ReferenceSolver, material: TexelMaterial, roughness: flo
 
 
 @torch.no_grad()
-def residual(inputs, solver: ReferenceSolver, frames: np.ndarray) -> float:
+def residual(views: Views, solver: ReferenceSolver, frames: np.ndarray) -> float:
     """Root mean square error (linear) of its own renders inside the mask, over a few of the frames."""
     squared, generator, geometry = [], torch.Generator().manual_seed(0), solver.geometry()
     for f in frames[spread_frames(len(frames), JUDGED_FRAMES)]:
-        picture, pose = inputs.picture(int(f)), inputs.camera_from_head[f]
+        picture, pose = views.picture(f), views.camera_from_head[f]
         hits = solver.raster.hits(geometry[2], pose)
         seen = np.nonzero((hits.face.ravel() >= 0) & (picture.inside.ravel() > 0))[0]
         seen = seen[spread_frames(len(seen), JUDGED_PIXELS)]

@@ -3,98 +3,188 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shared.appearance.chart_scale import describe_scale, scale_warnings, state_chart
+from shared.appearance.chart_scale import ChartStatement, describe_scale, scale_warnings, state_chart
 from shared.appearance.diagnostics import diagnostic_warnings, diagnostics_of, face_regions
 from shared.appearance.fine_normals import NormalPass, resolved_texels
-from shared.appearance.fit import Solution
+from shared.appearance.fit import Solution, fit_appearance
 from shared.appearance.light_models import SeveralLights
 from shared.appearance.local_roughness import local_roughness
 from shared.appearance.maps import make_maps
-from shared.appearance.problem import AppearanceProblem
-from shared.appearance.texture_pass import Clip, TexturePass
+from shared.appearance.observations import Capture, build_capture
+from shared.appearance.problem import AppearanceProblem, AppearanceSettings
+from shared.appearance.texture_pass import TexturePass
 from shared.capture.chart import ChartObservation
-from shared.geometry.mesh import uniform_laplacian
+from shared.compute.run_context import SILENT, RunContext
+from shared.geometry.mesh import Mesh, uniform_laplacian
+from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import TexelSurface
-from shared.inverse.light_and_mesh import LitClip, solve_light
+from shared.imaging.views import Views
+from shared.inverse.model_selection import SelectedModel, select
 from shared.inverse.problem import (
-    InverseInputs,
+    FACE_SKIN,
     InverseResult,
     InverseSettings,
-    frames_of,
     frames_to_fit,
     shade_vertices,
+    some_views,
 )
 from shared.inverse.published_clip import solve_by_reference
-from shared.shape.gauss_newton import typical_edge
-from shared.shape.refine import faces_of, meet_outline, surface_error
+from shared.rendering.precomputed_transfer import PrecomputedTransfer, precompute_transfer
+from shared.shape.gauss_newton import Reflectance, typical_edge
+from shared.shape.refine import meet_outline, refine_shape, subdivided_to, surface_error
 
 HAIRLINE_MM = 10.0
 """Bends of the hairline shorter than this are the mesh's, not the hair's."""
 
 
 def solve_clip(
-    inputs: InverseInputs,
+    views: Views,
+    surface: Surface,
     settings: InverseSettings,
-    progress: Callable,
-    note: Callable,
+    context: RunContext = SILENT,
     observations: Sequence[ChartObservation] = (),
 ) -> InverseResult:
-    """The whole of it. progress(items, label) wraps loops, note(text) logs a line; observations: of a colour chart in
-    view.
-    """
-    viewer = SurfaceViewer.of(inputs.mesh)
-    fitted = frames_to_fit(inputs, settings, viewer)
+    """The whole of it. views: which of them are fitted is decided here; observations: of a colour chart in view."""
+    viewer = SurfaceViewer.of(surface.mesh)
+    views = views.with_fitted(frames_to_fit(views, surface, settings, viewer))
     if settings.reference is not None:
-        return solve_by_reference(inputs, settings, settings.reference, fitted, progress, note)
+        return solve_by_reference(views, surface, settings, settings.reference, context)
     outline = {}
-    if settings.shape is not None and settings.shape.contour is not None and inputs.face_segment is not None:
-        frames = frames_of(inputs, settings, settings.shape.contour.frames, fitted)
-        inputs, outline = meet_outline(inputs, frames, settings.shape.contour, note)
-        viewer = SurfaceViewer.of(inputs.mesh)
-    moves = settings.appearance.light_moves(inputs.moves)
-    light = int(inputs.light_index[observations[0].frame]) if observations else 0
-    chart, warning = state_chart(observations, viewer.scene, inputs.camera_from_head, inputs.intrinsics, moves, light)
-    lit = solve_light(inputs, settings, viewer, fitted, chart, progress, note)
-    inputs, settings, viewer = lit.inputs, lit.settings, lit.viewer.within_rim(surface_error(lit.inputs.tracks))
-    diagnostics, solution = examine(lit)
-    shading = shade_vertices(inputs, settings.appearance, viewer, lit.precomputed, solution, progress)
-    surface = TexelSurface(inputs.mesh, settings.map_size)
-    clip = Clip(inputs.picture, inputs.camera_from_head, inputs.intrinsics, fitted, inputs.light_index)
+    if settings.shape is not None and settings.shape.contour is not None and surface.face_segment is not None:
+        contour = settings.shape.contour
+        surface, outline = meet_outline(some_views(views, settings, contour.frames), surface, contour, context)
+        viewer = SurfaceViewer.of(surface.mesh)
+    chart, chart_warning = state_chart(
+        observations,
+        viewer.scene,
+        views.camera_from_head,
+        views.intrinsics,
+        settings.appearance.light_moves(views.moves),
+        light=int(views.light_index[observations[0].frame]) if observations else 0,
+    )
+    selected = SelectedModel(surface, settings)
+    if settings.selection is not None:
+        selected = select(views, surface, settings, chart, context)
+    settings, shape_record = selected.settings, selected.shape_record
+    light_views = some_views(views, settings, settings.light_frames)
+
+    # Light on the mesh as it was tracked, or as model selection left it.
+    lit = LitSurface.of(selected.surface, light_views, settings, chart, context)
+    keeps_start = settings.selection is not None and selected.start is not None
+    solution = fit_appearance(lit.capture, settings.appearance, report_to(context), start=selected.start,
+                              keep_start=keeps_start)
+
+    # The mesh refined under that light, and the light anew; kept where held-out frames fit better.
+    if settings.shape is not None and lit.surface.face_segment is not None:
+        refined = refine_shape(
+            some_views(views, settings, settings.shape.frames),
+            lit.surface,
+            reflectance=Reflectance.of(solution, lit.precomputed),
+            appearance=settings.appearance,
+            sizes=settings.sizes,
+            settings=settings.shape,
+            context=context,
+        )
+        lit_then = LitSurface.of(refined.surface, light_views, settings, chart, context, before=lit.surface.mesh)
+        then = fit_appearance(lit_then.capture, settings.appearance, report_to(context), start=solution)
+        shape_record = judge_shape(solution, then) | {"stopped_vertices": refined.stopped}
+        context.note(f"refined mesh: {shape_record}")
+        if shape_record["refined"]:
+            lit, solution = lit_then, then
+    if selected.variation is not None:
+        solution = selected.variation.worn_by(solution)
+    diagnostics, solution = examine(lit, settings.appearance, solution)
+
+    # Under that light, of that shape: every texel's material, and relief finer than the mesh.
+    viewer = lit.viewer.within_rim(surface_error(lit.surface.tracks))
+    shading = shade_vertices(views, viewer, lit.precomputed, settings.appearance, solution, context)
+    texels = TexelSurface(lit.surface.mesh, settings.map_size)
     typical = np.median(solution.state.albedo, axis=0)
     texture = TexturePass(
-        surface, viewer, shading, clip, specular=specular_at(surface, solution), typical_albedo=typical,
-        light_weights=solution.light_weights, region=scalp_of(inputs), progress=progress,
+        texels, viewer, shading, views, specular=specular_at(texels, solution), typical_albedo=typical,
+        light_weights=solution.light_weights, region=scalp_of(lit.surface), context=context,
     )
     widths = settings.map_size * np.array(settings.specular_widths if settings.appearance.specular else (np.inf,))
     material, texture_record = texture.run(widths)
-    roughness, local = solution.state.roughness, solution.local_roughness_fit
-    roughness = roughness if local is None else local.roughness(inputs.mesh.vertices)
     turn, relief = None, {}
     if settings.normal_map:
-        fine = NormalPass(surface, viewer, shading, clip, material, progress)
-        turn, relief = fine.run(resolved_texels(surface, clip))
-        note(f"fine normals: {relief}")
-    maps = make_maps(surface, material, roughness, turn)
-    warnings = [warning] * bool(warning) + scale_warnings(chart, typical)
-    warnings += diagnostic_warnings(diagnostics, inputs.moves)
-    shape_record = {**lit.shape_record, "outline": outline}
-    record = {"texture": texture_record, "shape": shape_record, "relief": relief, "signs": diagnostics}
-    record |= {"warnings": warnings, "albedo_scale": describe_scale(chart, typical), "rungs": lit.candidates}
-    return InverseResult(solution, material, maps, shading, viewer, fitted, record)
+        fine = NormalPass(texels, viewer, shading, views, material, context)
+        turn, relief = fine.run(resolved_texels(texels, views))
+        context.note(f"fine normals: {relief}")
+    roughness, local = solution.state.roughness, solution.local_roughness_fit
+    roughness = roughness if local is None else local.roughness(lit.surface.mesh.vertices)
+    record = {
+        "texture": texture_record,
+        "shape": {**shape_record, "outline": outline},
+        "relief": relief,
+        "signs": diagnostics,
+        "warnings": [*filter(None, [chart_warning]), *scale_warnings(chart, typical),
+                     *diagnostic_warnings(diagnostics, views.moves)],
+        "albedo_scale": describe_scale(chart, typical),
+        "rungs": selected.candidates,
+    }
+    return InverseResult(
+        solution, material, make_maps(texels, material, roughness, turn), shading, viewer, views.fitted, record
+    )
 
 
-def examine(lit: LitClip) -> tuple[dict[str, float], Solution]:
+@dataclass(frozen=True, eq=False)
+class LitSurface:
+    """A surface ready for its light to be solved: its viewer, precomputed transfer, and what the skin's points show."""
+
+    surface: Surface
+    viewer: SurfaceViewer
+    precomputed: PrecomputedTransfer
+    capture: Capture
+
+    @classmethod
+    def of(
+        cls,
+        surface: Surface,
+        views: Views,
+        settings: InverseSettings,
+        chart: ChartStatement | None,
+        context: RunContext,
+        before: Mesh | None = None,
+    ) -> LitSurface:
+        """Of a surface in some views; before: its mesh before refinement, by which its points are spread."""
+        layout = None if before is None else subdivided_to(before, surface.mesh).vertices
+        viewer = SurfaceViewer.of(surface.mesh, layout)
+        precomputed = precompute_transfer(viewer, settings.sizes, settings.appearance.visibility)
+        moves, skin = settings.appearance.light_moves(views.moves), surface.vertices_of(FACE_SKIN)
+        capture = build_capture(viewer, precomputed, views, moves, skin, settings.sizes.points, context)
+        return cls(surface, viewer, precomputed, replace(capture, chart=chart))
+
+
+def report_to(context: RunContext) -> Callable[[dict], None]:
+    """A line for the log of each step's record."""
+    return lambda record: context.note(
+        f"{record['light']} {record['resolution']}, step {record['step']}: residual {record['fitted']:.5f} fitted, "
+        f"{record['held_out']:.5f} held out; specular {record['specular_intensity']:.3f}, "
+        f"roughness {record['roughness']:.3f}"
+    )
+
+
+def judge_shape(before: Solution, after: Solution) -> dict:
+    """Is the refined mesh kept, and why: held-out residuals, fitted ones where no frame could be held out."""
+    name = "held_out" if before.held_out > 0 else "fitted"
+    residuals = {"before": getattr(before, name), "after": getattr(after, name)}
+    return {"refined": residuals["after"] < residuals["before"], name: residuals}
+
+
+def examine(
+    lit: LitSurface, settings: AppearanceSettings, solution: Solution
+) -> tuple[dict[str, float], Solution]:
     """What the samples show beside the light: diagnostics of what the model cannot follow, and the solution with
     roughness that varies over the skin where that serves."""
-    settings, solution, inputs = lit.settings.appearance, lit.solution, lit.inputs
-    problem = AppearanceProblem.of(lit.capture, settings)
+    problem, surface = AppearanceProblem.of(lit.capture, settings), lit.surface
     positions = lit.capture.points.positions
-    regions = face_regions(inputs.mesh, inputs.face_segment, inputs.segment_names, positions)
+    regions = face_regions(surface.mesh, surface.face_segment, surface.segment_names, positions)
     diagnostics = diagnostics_of(problem, solution.state, regions)
     if settings.specular and settings.local_roughness:
         fit, said = local_roughness(problem, solution.state)
@@ -102,14 +192,14 @@ def examine(lit: LitClip) -> tuple[dict[str, float], Solution]:
     return diagnostics, solution
 
 
-def scalp_of(inputs: InverseInputs) -> np.ndarray | None:
+def scalp_of(surface: Surface) -> np.ndarray | None:
     """[V] bool: vertices of the scalp, whose hair says nothing of the skin, within a border as smooth as a hairline;
     None where the mesh has no segments."""
-    if inputs.face_segment is None:
+    if surface.face_segment is None:
         return None
-    mesh = inputs.mesh
+    mesh = surface.mesh
     scalp = np.zeros(len(mesh.vertices))
-    scalp[mesh.faces[faces_of(inputs, ("scalp",))]] = 1.0
+    scalp[mesh.faces[surface.faces_of(("scalp",))]] = 1.0
     laplacian = uniform_laplacian(mesh.faces, len(scalp))
     for _ in range(round((HAIRLINE_MM / typical_edge(mesh.vertices, mesh.faces)) ** 2)):
         scalp -= 0.5 * (laplacian @ scalp)
@@ -131,8 +221,8 @@ def describe_light(state) -> str:
     return f"{several}cubemap of 6 x {model.resolution}^2 texels from {numbers // count} numbers per channel"
 
 
-def summarise(inputs: InverseInputs, result: InverseResult) -> dict:
-    """What solve.json says, but for which frames were rendered and held out."""
+def summarise(result: InverseResult, moves: str) -> dict:
+    """What solve.json says, but for which frames were rendered and held out; moves: the head or the camera."""
     solution, state = result.solution, result.solution.state
     seen = result.material.information > 1.0
     return {
@@ -142,7 +232,7 @@ def summarise(inputs: InverseInputs, result: InverseResult) -> dict:
             "specular_variation": "by segment" if solution.local_specular else result.record["texture"]["chosen"],
             "roughness": round(state.roughness, 4),
             "roughness_variation": solution.roughness_record,
-            "moves": inputs.moves,
+            "moves": moves,
         },
         "residuals": {
             "fitted": solution.fitted,

@@ -14,7 +14,6 @@ no silhouettes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -25,7 +24,7 @@ from shared.appearance.light_models import make_light_model
 from shared.geometry.mesh import Mesh
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import world_from_head
-from shared.imaging.image_sampling import Picture
+from shared.imaging.views import Views
 from shared.published.raster import Hits, Raster, blend, torch_vertex_normals
 from shared.published.settings import ReferenceSettings
 from shared.published.shading import Shader, TorchMaterial
@@ -39,17 +38,6 @@ _PICTURE_BYTES = 400e6
 
 
 @dataclass(frozen=True)
-class Views:
-    """F frames to fit: picture(f), poses [F, 4, 4], intrinsics [3, 3], size (width, height), what moves."""
-
-    picture: Callable[[int], Picture]
-    camera_from_head: np.ndarray
-    intrinsics: np.ndarray
-    size: tuple[int, int]
-    moves: str
-
-
-@dataclass(frozen=True)
 class Start:
     """radiance [3] of a uniform light; albedo [S, S, 3] and specular_intensity [S, S] maps."""
 
@@ -59,7 +47,8 @@ class Start:
 
 
 class ReferenceSolver:
-    """Parameters are torch leaves by name: vertices (large-steps space), light, albedo, specular, roughness."""
+    """Fits all views, which share one lens. Parameters are torch leaves by name: vertices (large-steps space), light,
+    albedo, specular, roughness."""
 
     def __init__(self, mesh: Mesh, views: Views, start: Start, settings: ReferenceSettings, dtype=torch.float32):
         self.mesh, self.views, self.settings, self.dtype = mesh, views, settings, dtype
@@ -67,7 +56,7 @@ class ReferenceSolver:
         few = settings.light_model != "cubemap"
         self.light_model = make_light_model(settings.light_model, MODEL_RESOLUTION) if few else None
         resolution = MODEL_RESOLUTION if few else settings.resolution
-        self.raster = Raster(mesh, views.intrinsics, views.size, self.device, dtype)
+        self.raster = Raster(mesh, views.intrinsics[0], views.size, self.device, dtype)
         self.shader = Shader(resolution, settings.sampling, min(settings.smallest, resolution), self.device, dtype)
         self.steps = LargeSteps(mesh.faces, len(mesh.vertices), settings.smoothing)
         self.laplacian = LaplacianLoss(mesh.faces, len(mesh.vertices), self.device, dtype)

@@ -7,7 +7,6 @@ whether a step is kept.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,9 +16,11 @@ from shared.appearance.fit import Solution
 from shared.appearance.local_roughness import SpecularEquations
 from shared.appearance.observations import face_front
 from shared.appearance.problem import AppearanceSettings
-from shared.compute.read_ahead import read_ahead
+from shared.compute.run_context import SILENT, RunContext
 from shared.geometry.mesh import Mesh, subdivide, vertex_normals
+from shared.geometry.surface import TrackPoints
 from shared.imaging.image_sampling import SurfaceViewer
+from shared.imaging.views import Views
 from shared.rendering.normal_derivatives import Reflections, shading_terms
 from shared.rendering.precomputed_transfer import PrecomputedTransfer, Sizes, precompute_transfer
 from shared.rendering.shading import DEEP, Material, VertexShading
@@ -29,7 +30,6 @@ from shared.shape.samples import SurfaceView, look_at_surface, sample_surface
 from shared.shape.silhouette import ContourSettings
 from shared.shape.step import (
     LARGEST_STEP_EDGES,
-    TrackPoints,
     large_step_metric,
     normal_turns,
     point_terms,
@@ -87,20 +87,6 @@ class Reflectance:
         )
 
 
-@dataclass(frozen=True)
-class ShapeClip:
-    """picture(f) of F frames, camera_from_head [F, 4, 4], intrinsics [3, 3] or [F, 3, 3], fitted [F] bool, what moves
-    against the light, the track points, where there are any, and each frame's light, None: there is one."""
-
-    picture: Callable
-    camera_from_head: np.ndarray
-    intrinsics: np.ndarray
-    fitted: np.ndarray
-    moves: str
-    tracks: TrackPoints | None = None
-    light_index: np.ndarray | None = None
-
-
 MOST_WORSE = 1
 """Steps in a row after which held-out frames may fit worse: the first of a finer level often is one by a hair, and the
 next more than makes up for it. The best of all stays."""
@@ -125,12 +111,12 @@ class Traced:
     index: np.ndarray
     points: Points
     transfer: Transfer
-    views: list[SurfaceView]
+    looks: list[SurfaceView]
     reflections: Reflections | None
 
     def kept(self) -> Traced:
         """What a finer level needs of it: neither pictures nor reflections."""
-        return replace(self, views=[], reflections=None)
+        return replace(self, looks=[], reflections=None)
 
     def turned_to(self, normals: np.ndarray) -> Transfer:
         """The transfer for other normals [P, 3] under the same visibility."""
@@ -139,30 +125,28 @@ class Traced:
 
 
 class ShapeSolver:
-    """Refines a mesh and its subdivisions from a clip."""
+    """Refines a mesh and its subdivisions from views of it; tracks: what tracking knows of the surface, or None."""
 
     def __init__(
         self,
-        clip: ShapeClip,
+        views: Views,
+        tracks: TrackPoints | None,
         reflectance: Reflectance,
         appearance: AppearanceSettings,
         sizes: Sizes,
         settings: ShapeSettings,
-        progress: Callable = lambda items, label: items,
-        note: Callable = lambda text: None,
+        context: RunContext = SILENT,
     ):
-        self.progress = progress
-        self.clip, self.reflectance = clip, reflectance
-        self.appearance, self.sizes, self.settings, self.note = appearance, sizes, settings, note
+        self.views, self.tracks, self.reflectance = views, tracks, reflectance
+        self.appearance, self.sizes, self.settings, self.context = appearance, sizes, settings, context
 
     def trace(self, mesh: Mesh, shaped: np.ndarray, before: Traced | None = None) -> Traced:
         """Looks at the shaped faces' vertices that some frame faces. before: of a coarser level, whose nearest point
         tells what each sees."""
-        clip = self.clip
-        viewer = SurfaceViewer.of(mesh)
+        views, viewer = self.views, SurfaceViewer.of(mesh)
         wanted = np.zeros(len(mesh.vertices), bool)
         wanted[mesh.faces[shaped]] = True
-        index = np.nonzero(wanted & face_front(viewer, clip.camera_from_head, 0.2))[0]
+        index = np.nonzero(wanted & face_front(viewer, views.camera_from_head, 0.2))[0]
         points = mesh_points(mesh, index)
         if before is None:
             precomputed = precompute_transfer(viewer, self.sizes, self.appearance.visibility)
@@ -170,9 +154,8 @@ class ShapeSolver:
         else:
             precomputed, transfer = before.precomputed, before.transfer.take(nearest_points(points, before.points))
         blur = BLUR_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
-        pictures = read_ahead(map(clip.picture, self.progress(range(len(clip.camera_from_head)), "shape, sampling")))
-        views = look_at_surface(viewer, index, pictures, clip.camera_from_head, clip.intrinsics, blur)
-        traced = Traced(precomputed, index, points, transfer, views, None)
+        looks = look_at_surface(viewer, index, views, blur, self.context)
+        traced = Traced(precomputed, index, points, transfer, looks, None)
         if not self.appearance.specular or len(index) < FEWEST_POINTS:
             return traced
         shading = self._shade(mesh, traced, points, traced.turned_to(points.normals))
@@ -180,13 +163,13 @@ class ShapeSolver:
 
     def examine(self, mesh: Mesh, shaped: np.ndarray, traced: Traced) -> ShapedSurface | None:
         """Samples, shading and equations of the traced vertices; None where hardly any is seen."""
-        clip, settings, index = self.clip, self.settings, traced.index
+        views, settings, index = self.views, self.settings, traced.index
         points = mesh_points(mesh, index)
-        samples = sample_surface(points.positions, traced.views, clip.camera_from_head, clip.intrinsics)
+        samples = sample_surface(points.positions, traced.looks, views.camera_from_head, views.intrinsics)
         if self.reflectance.light_weights:
-            samples.weight[:] *= np.array(self.reflectance.light_weights, np.float32)[clip.light_index]
+            samples.weight[:] *= np.array(self.reflectance.light_weights, np.float32)[views.light_index]
         transfer = traced.turned_to(points.normals)
-        seen = (samples.weight[:, clip.fitted] > 0).sum(1) >= min(MINIMUM_FRAMES, int(clip.fitted.sum()))
+        seen = (samples.weight[:, views.fitted] > 0).sum(1) >= min(MINIMUM_FRAMES, int(views.fitted.sum()))
         rows = np.nonzero(seen & (transfer.blocked < DEEP))[0]
         if len(rows) < FEWEST_POINTS:
             return None
@@ -200,7 +183,7 @@ class ShapeSolver:
             points.positions,
             points.normals,
             self.reflectance.specular,
-            clip.fitted,
+            views.fitted,
             settings.equations,
         )
         return ShapedSurface(mesh, index[rows], terms.tangents, equations)
@@ -218,10 +201,10 @@ class ShapeSolver:
             Material(node_albedo, known.specular, known.roughness, local),
             known.light,
             precomputed.directions,
-            self.clip.camera_from_head,
-            self.clip.moves,
+            self.views.camera_from_head,
+            self.appearance.light_moves(self.views.moves),
             bounce=self.appearance.bounce,
-            light_index=self.clip.light_index,
+            light_index=self.views.light_index,
         )
 
     def step(self, surface: ShapedSurface, start: np.ndarray, shaped: np.ndarray, held: np.ndarray) -> np.ndarray:
@@ -230,14 +213,14 @@ class ShapeSolver:
         normals = vertex_normals(mesh.vertices, mesh.faces)
         turns = normal_turns(mesh.vertices, mesh.faces, normals, surface.index, surface.tangents)
         terms = [point_terms(surface.index, turns, surface.equations.hessian, surface.equations.gradient, count)]
-        if self.clip.tracks is not None:
-            rows, height, weight = track_rows(mesh.vertices, mesh.faces, normals, shaped, self.clip.tracks)
+        if self.tracks is not None:
+            rows, height, weight = track_rows(mesh.vertices, mesh.faces, normals, shaped, self.tracks)
             weighted = rows.T @ sparse.diags(weight)
             terms.append(((weighted @ rows).tocsr(), -(weighted @ height)))
         metric = large_step_metric(mesh.faces, count, self.settings.smoothness, self.settings.sigma_mm)
         free = np.ones(count, bool)
         free[mesh.faces[held]] = False
-        offsets = solve_offsets(mesh.vertices, start, normals, metric, free, terms, self.note)
+        offsets = solve_offsets(mesh.vertices, start, normals, metric, free, terms, self.context.note)
         largest = LARGEST_STEP_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
         return np.clip(offsets, -largest, largest)
 
@@ -263,9 +246,9 @@ class ShapeSolver:
     def _refine_level(self, mesh, start, shaped, held, level, traced: Traced) -> Mesh:
         surface = self.examine(mesh, shaped, traced)
         if surface is None:
-            self.note(f"shape level {level}: too little of the face is seen, the mesh stays")
+            self.context.note(f"shape level {level}: too little of the face is seen, the mesh stays")
             return mesh
-        self.note(f"shape level {level}: {len(surface.index)} points, {_residuals(surface)}")
+        self.context.note(f"shape level {level}: {len(surface.index)} points, {_residuals(surface)}")
         best, worse = surface, 0
         for number in range(self.settings.rounds):
             offsets = self.step(surface, start, shaped, held)
@@ -277,7 +260,8 @@ class ShapeSolver:
             if moved is None:
                 break
             moves = np.abs(offsets[moved.index])
-            self.note(f"  moved {np.median(moves):.3f} mm, 95 % {np.percentile(moves, 95):.3f}: {_residuals(moved)}")
+            moved_mm = f"moved {np.median(moves):.3f} mm, 95 % {np.percentile(moves, 95):.3f}"
+            self.context.note(f"  {moved_mm}: {_residuals(moved)}")
             surface = moved
             if moved.equations.judged <= best.equations.judged:
                 best, worse = moved, 0

@@ -6,14 +6,16 @@ Pictures are blurred to what the points can resolve, so that colour and slope be
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from shared.compute.read_ahead import read_ahead
+from shared.compute.run_context import RunContext
 from shared.geometry.transforms import project, projection_slope
 from shared.imaging.image_sampling import Picture, SurfaceViewer, remap, sample_inside, sample_saturation
+from shared.imaging.views import Views
 
 LEAST_BLUR_PX = 0.3
 MARGIN_PX = 8
@@ -51,26 +53,21 @@ class SurfaceView:
 
 
 def look_at_surface(
-    viewer: SurfaceViewer,
-    index: np.ndarray,
-    pictures: Iterable[Picture],
-    camera_from_head: np.ndarray,
-    intrinsics: np.ndarray,
-    blur_mm: float,
+    viewer: SurfaceViewer, index: np.ndarray, views: Views, blur_mm: float, context: RunContext
 ) -> list[SurfaceView]:
-    """The vertices index [P] in F frames, as often as they are then sampled after small moves.
+    """The vertices index [P] in F views, as often as they are then sampled after small moves.
 
-    pictures: F, read once in order; camera_from_head [F, 4, 4]; intrinsics [3, 3] or [F, 3, 3]; blur_mm: standard
-    width of the blur on the surface.
+    Pictures are read once, in order; blur_mm: standard width of the blur on the surface.
     """
-    views, intrinsics = [], np.broadcast_to(intrinsics, (len(camera_from_head), 3, 3))
+    found = []
     viewer, index = viewer.limited_to(index)
-    for pose, lens, picture in zip(camera_from_head, intrinsics, pictures, strict=True):
+    pictures = read_ahead(map(views.picture, context.progress(range(len(views)), "shape, sampling")))
+    for pose, lens, picture in zip(views.camera_from_head, views.intrinsics, pictures, strict=True):
         view = viewer.view(pose, lens, picture.inside.shape[::-1])
         weight = view.weight[index]
         seen = index[weight > 0]
         if len(seen) == 0:
-            views.append(SurfaceView(picture, (0, 0), weight))
+            found.append(SurfaceView(picture, (0, 0), weight))
             continue
         sigma = blur_mm * float(lens[0, 0]) / float(np.median(view.depth[seen]))
         low = np.maximum(np.floor(view.pixels[seen].min(0)).astype(int) - MARGIN_PX, 0)
@@ -80,19 +77,19 @@ def look_at_surface(
         if sigma > LEAST_BLUR_PX:
             image = cv2.GaussianBlur(image, (0, 0), sigma)
         cut = Picture((image[part].astype(np.float16),), picture.saturation[part].copy(), picture.inside[part].copy())
-        views.append(SurfaceView(cut, (int(low[0]), int(low[1])), weight))
-    return views
+        found.append(SurfaceView(cut, (int(low[0]), int(low[1])), weight))
+    return found
 
 
 def sample_surface(
     positions: np.ndarray, views: list[SurfaceView], camera_from_head: np.ndarray, intrinsics: np.ndarray
 ) -> SurfaceSamples:
-    """Samples of P points [P, 3] in F frames [F, 4, 4]; intrinsics [3, 3] or [F, 3, 3]."""
+    """Samples of P points at positions [P, 3] mm in the views of F frames, camera_from_head [F, 4, 4] and intrinsics
+    [F, 3, 3] px."""
     shape = (len(positions), len(camera_from_head))
     colours, saturation = np.zeros(shape + (3,), np.float32), np.zeros(shape + (3,), np.int8)
     gradient = np.zeros(shape + (3, 2), np.float16)
     slope, weight = np.zeros(shape + (2, 3), np.float32), np.zeros(shape, np.float32)
-    intrinsics = np.broadcast_to(intrinsics, (len(camera_from_head), 3, 3))
     for f, (view, pose, lens) in enumerate(zip(views, camera_from_head, intrinsics, strict=True)):
         seen = np.nonzero(view.weight > 0)[0]
         if len(seen) == 0:

@@ -11,7 +11,7 @@ that ears and skull, which no track and little shading reaches, move as a whole.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -19,10 +19,12 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
+from shared.compute.run_context import SILENT, RunContext
 from shared.geometry.mesh import Mesh, loop_subdivision, mesh_edges, normalised, vertex_normals
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import project, projection_slope
 from shared.imaging.image_sampling import remap
+from shared.imaging.views import Views
 from shared.shape.step import large_step_metric
 
 CAUCHY_SCALE, FARTHEST_SIGMAS = 2.5, 8.0
@@ -51,17 +53,6 @@ class ContourSettings:
 
 
 @dataclass(frozen=True)
-class Outlines:
-    """Signed distance to the mask's border in F frames [H, W] px, positive outside, their poses [F, 4, 4], fitted
-    [F] bool, intrinsics [F, 3, 3]."""
-
-    distance: tuple[np.ndarray, ...]
-    camera_from_head: np.ndarray
-    fitted: np.ndarray
-    intrinsics: np.ndarray
-
-
-@dataclass(frozen=True)
 class OccludingContour:
     """Points of the occluding contour in all frames that have a border near: frame [n], edge [n, 2], share [n] of the
     way along it, slope [n, 3] of the distance by the point's place, px per mm, distance [n] px; met: how many of all
@@ -87,12 +78,15 @@ def mask_distance(mask: np.ndarray) -> np.ndarray:
     return np.where(person > 0, 0.5 - inside, outside - 0.5).astype(np.float32)
 
 
-def occluding_contour(mesh: Mesh, usable: np.ndarray, outlines: Outlines, reach_mm: float) -> OccludingContour:
-    """The mesh's occluding contour in the frames. usable [faces] bool: faces whose edges count."""
+def occluding_contour(
+    mesh: Mesh, usable: np.ndarray, views: Views, distances: Sequence[np.ndarray], reach_mm: float
+) -> OccludingContour:
+    """The mesh's occluding contour in the views. usable [faces] bool: faces whose edges count; distances: of each view
+    [H, W], see mask_distance; reach_mm: farther borders are something else's."""
     normals, scene = vertex_normals(mesh.vertices, mesh.faces), RayScene(mesh.vertices, mesh.faces)
     edges = mesh_edges(mesh.faces[usable])[0]
     parts, count = [], 0
-    frames = zip(outlines.distance, outlines.camera_from_head, outlines.intrinsics, strict=True)
+    frames = zip(distances, views.camera_from_head, views.intrinsics, strict=True)
     for f, (distance, pose, lens) in enumerate(frames):
         turning, share, outward = _turning_points(mesh, normals, edges, scene, pose, lens)
         points = _between(mesh.vertices, turning, share)
@@ -128,12 +122,12 @@ def fit_outline(
     mesh: Mesh,
     usable: np.ndarray,
     known: np.ndarray,
-    outlines: Outlines,
+    views: Views,
     settings: ContourSettings,
-    note: Callable = lambda text: None,
+    context: RunContext = SILENT,
 ) -> tuple[Mesh, dict]:
-    """The mesh moved so that its outline meets the masks' borders, as long as that helps held-out frames, and a record
-    of the mean distances in px.
+    """The mesh moved so that its outline meets the borders of the views' masks, as long as that helps held-out frames,
+    and a record of the mean distances in px.
 
     mesh: one that was subdivided; usable [faces] bool: whose edges count; known [V] bool: vertices that stay, since
     something better tells where they are.
@@ -141,17 +135,18 @@ def fit_outline(
     spread, parents = _before_subdivision(mesh)
     prior = large_step_metric(parents, spread.shape[1], settings.smoothness, settings.sigma_mm)
     prior = prior + sparse.diags(known[: spread.shape[1]] / settings.known_mm**2)
-    start, moved = mesh.vertices, np.zeros((spread.shape[1], 3))
-    contour = occluding_contour(mesh, usable, outlines, settings.reach_mm)
+    start, moved, note = mesh.vertices, np.zeros((spread.shape[1], 3)), context.note
+    distances = [mask_distance(views.mask(f)) for f in range(len(views))]
+    contour = occluding_contour(mesh, usable, views, distances, settings.reach_mm)
     if contour.met < LEAST_MET:
         note(f"outline: {contour.met:.0%} of it lies near the masks' borders: they are not the head's")
         return mesh, {"met": contour.met}
-    first = best = _mean_distance(contour, outlines.fitted, settings)
+    first = best = _mean_distance(contour, views.fitted, settings)
     for _ in range(settings.rounds):
-        moved = moved + _step(spread, prior, moved, contour, outlines.fitted, settings)
+        moved = moved + _step(spread, prior, moved, contour, views.fitted, settings)
         trial = mesh.replace(vertices=start + spread @ moved)
-        contour = occluding_contour(trial, usable, outlines, settings.reach_mm)
-        now = _mean_distance(contour, outlines.fitted, settings)
+        contour = occluding_contour(trial, usable, views, distances, settings.reach_mm)
+        now = _mean_distance(contour, views.fitted, settings)
         note(f"outline: {best[0]:.2f} -> {now[0]:.2f} px fitted, {best[1]:.2f} -> {now[1]:.2f} px held out")
         if not now[1] < best[1]:
             break

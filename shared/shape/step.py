@@ -14,7 +14,6 @@ Reference: [Nicolet2021].
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
@@ -23,6 +22,7 @@ from scipy.spatial import cKDTree
 
 from shared.geometry.mesh import face_normals, normalised, vertex_adjacency
 from shared.geometry.raycast import RayScene
+from shared.geometry.surface import TrackPoints
 
 PRECISION = 1e-5
 """Of a step's solution, by its residual: offsets are then right to a tenth of a micrometre, three times sooner than by
@@ -31,14 +31,6 @@ MOST_ITERATIONS = 5000
 """Of a step's solution: ten times as many as the finest meshes take."""
 LARGEST_STEP_EDGES = 0.5
 TRACK_REACH_MM = 4.0
-
-
-@dataclass(frozen=True)
-class TrackPoints:
-    """Points on the skin known from tracking: positions [N, 3] head space and standard deviation [N], mm."""
-
-    positions: np.ndarray
-    sigma_mm: np.ndarray
 
 
 def normal_turns(

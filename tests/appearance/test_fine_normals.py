@@ -16,11 +16,11 @@ from shared.appearance.fine_normals import (
     uv_tangents,
 )
 from shared.appearance.texture import TexelMaterial
-from shared.appearance.texture_pass import Clip
 from shared.geometry.mesh import interpolate, vertex_normals
 from shared.geometry.raycast import RayScene, camera_hits
 from shared.imaging.image_sampling import SurfaceViewer, prepare_picture
 from shared.imaging.texels import TexelSurface
+from shared.imaging.views import Views
 from shared.rendering.envmap import cube_directions
 
 FRAMES, WAVE_MM, HEIGHT_MM = 16, 18.0, 0.4
@@ -123,9 +123,10 @@ def test_bumps_finer_than_the_mesh_are_found_and_none_where_there_are_none(bumpy
         np.full(len(surface), SPECULAR, np.float32),
         np.full(len(surface), 400.0),
     )
-    clip = Clip(pictures.__getitem__, poses, LENS, np.arange(FRAMES) % 4 != 2)
+    fitted = np.arange(FRAMES) % 4 != 2
+    views = Views.in_one_light(poses, LENS, (SIZE, SIZE), "head", pictures.__getitem__, None, fitted)
     viewer = SurfaceViewer.of(mesh)
-    turn, record = NormalPass(surface, viewer, shading, clip, material).run(1.0)
+    turn, record = NormalPass(surface, viewer, shading, views, material).run(1.0)
     front = places[:, 2] > 60.0
     if not bumpy:
         assert np.degrees(np.linalg.norm(turn[front], axis=1).mean()) < 1.0

@@ -36,7 +36,7 @@ def frames_of(capture, chosen):
     parts = (samples.colours, samples.weight, samples.saturation, samples.towards_camera)
     samples = type(samples)(*(part[:, chosen] for part in parts))
     return replace(capture, samples=samples, world_from_head=capture.world_from_head[chosen],
-                   fitted=capture.fitted[chosen], light_index=None)
+                   fitted=capture.fitted[chosen], light_index=0 * capture.light_index[chosen])
 
 
 def albedo_error(capture, albedo, settings=SETTINGS):

@@ -5,13 +5,14 @@ import pytest
 from shapes import grid_plane
 
 from shared.appearance.maps import make_maps
-from shared.appearance.texture_pass import Clip, TexturePass
+from shared.appearance.texture_pass import TexturePass
 from shared.geometry.mesh import interpolate
 from shared.geometry.raycast import RayScene, camera_hits
 from shared.geometry.transforms import rigid, rotation_from_vector
 from shared.imaging.image_sampling import SurfaceViewer, prepare_picture
 from shared.imaging.texels import TexelSurface
 from shared.imaging.texture import sample_bilinear
+from shared.imaging.views import Views
 
 SIZE, LENS = (96, 96), np.array([[400.0, 0, 48], [0, 400.0, 48], [0, 0, 1]])
 FRAMES, SPECULAR, MAP = 10, 0.6, 48
@@ -67,7 +68,7 @@ def true_albedo(uv):
     return np.stack([0.5 + 0.2 * np.sin(6 * x), 0.35 + 0.15 * y, 0.25 + 0.1 * np.cos(5 * (x + y))], axis=-1)
 
 
-def plate_clip(mesh, shading, clip_at=np.inf):
+def plate_views(mesh, shading, clip_at=np.inf):
     """Pictures of the plate swinging +-12 degrees; its right fifth is behind the mask's border in all frames."""
     scene = RayScene(mesh.vertices, mesh.faces)
     swing = np.radians(12.0) * np.sin(np.arange(FRAMES))
@@ -87,15 +88,15 @@ def plate_clip(mesh, shading, clip_at=np.inf):
         mask[hit] = np.where(uv[:, 0] < 0.8, 255, 0)
         pictures.append(prepare_picture(codes, np.minimum(linear, clip_at), mask))
     fitted = np.arange(FRAMES) % 5 != 2
-    return Clip(pictures.__getitem__, poses, LENS, fitted)
+    return Views.in_one_light(poses, LENS, SIZE, "head", pictures.__getitem__, None, fitted)
 
 
 def run_pass(clip_at=np.inf, specular=SPECULAR, widths=(np.inf,)):
     mesh = grid_plane(33, 80.0)
     shading = PlateShading(mesh)
     surface, viewer = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh)
-    clip = plate_clip(mesh, shading, clip_at)
-    texture = TexturePass(surface, viewer, shading, clip, specular, np.array([0.5, 0.4, 0.25]))
+    views = plate_views(mesh, shading, clip_at)
+    texture = TexturePass(surface, viewer, shading, views, specular, np.array([0.5, 0.4, 0.25]))
     material, record = texture.run(widths)
     return surface, material, record, make_maps(surface, material, 0.4)
 
@@ -138,9 +139,9 @@ def test_more_frames_mean_more_confidence():
     mesh = grid_plane(17, 80.0)
     shading, surface = PlateShading(mesh), TexelSurface(mesh, 24)
     viewer, found = SurfaceViewer.of(mesh), []
-    clip = plate_clip(mesh, shading)
-    for fitted in (np.arange(FRAMES) == 0, clip.fitted):
-        few = Clip(clip.picture, clip.camera_from_head, LENS, fitted)
+    views = plate_views(mesh, shading)
+    for fitted in (np.arange(FRAMES) == 0, views.fitted):
+        few = views.with_fitted(fitted)
         material, _ = TexturePass(surface, viewer, shading, few, SPECULAR, np.full(3, 0.4)).run((np.inf,))
         found.append(make_maps(surface, material, 0.4)["confidence"].ravel()[surface.pixel])
     seen = texel_uv(surface)[:, 0] < 0.7
@@ -150,10 +151,10 @@ def test_more_frames_mean_more_confidence():
 def test_borders_of_shadows_that_lie_elsewhere_spoil_little():
     """Samples near a border that may lie elsewhere count less, and texels that have no others are trusted less."""
     mesh, found = grid_plane(33, 80.0), []
-    surface, viewer, clip = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh), plate_clip(mesh, ShadedPlate(mesh))
+    surface, viewer, views = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh), plate_views(mesh, ShadedPlate(mesh))
     for uncertainty in (False, True):
         shading = ShadedPlate(mesh, 0.04, uncertainty)
-        material, _ = TexturePass(surface, viewer, shading, clip, SPECULAR, np.array([0.5, 0.4, 0.25])).run((np.inf,))
+        material, _ = TexturePass(surface, viewer, shading, views, SPECULAR, np.array([0.5, 0.4, 0.25])).run((np.inf,))
         confidence = make_maps(surface, material, 0.4)["confidence"].ravel()[surface.pixel]
         found.append((np.abs(np.log(material.albedo / true_albedo(texel_uv(surface)))).max(1), confidence))
     (plain, sure), (uncertain, less_sure) = found

@@ -106,7 +106,7 @@ def make_truth(
     samples = Samples(np.clip(colours, 0, clip_at).astype(np.float32), weight, saturation, towards.astype(np.float32))
     fitted, skin = np.tile(np.arange(FRAMES) % 5 != 2, len(lights)), np.ones(len(points), bool)
     capture = Capture(
-        points, samples, transfer, nodes, node_transfer, DIRECTIONS, turns, fitted, skin, light_index=light_index
+        points, samples, transfer, nodes, node_transfer, DIRECTIONS, turns, fitted, skin, light_index
     )
     seen = (weight[:, fitted] > 0).sum(1) >= 4
     index = np.nonzero(seen)[0]

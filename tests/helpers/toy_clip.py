@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from toy_head import toy_head
 
-from shared.geometry.mesh import Mesh
+from shared.geometry.surface import Surface
 from shared.geometry.transforms import rigid, rotation_from_vector
 from shared.imaging.color import encode_srgb
 from shared.imaging.image_sampling import prepare_picture
+from shared.imaging.views import Views
 from shared.rendering.envmap import cube_directions, latlong_from_cube
 from shared.rendering.precomputed_transfer import Sizes
 from shared.rendering.views import HeadViews, ViewCamera
@@ -21,23 +22,18 @@ LENS = np.array([[230.0, 0, 32], [0, 230.0, 32], [0, 0, 1]])
 
 @dataclass(frozen=True)
 class ToyClip:
-    """What the solvers read of a clip."""
+    """A clip as solvers take it."""
 
-    mesh: Mesh
-    camera_from_head: np.ndarray
-    pictures: tuple
-    intrinsics: np.ndarray = field(default_factory=LENS.copy)
-    size: tuple[int, int] = SIZE
-    moves: str = "head"
-    face_segment: np.ndarray | None = None
-    segment_names: tuple[str, ...] = ()
+    views: Views
+    surface: Surface
 
     @property
-    def light_index(self):
-        return np.zeros(len(self.camera_from_head), int)
+    def mesh(self):
+        return self.surface.mesh
 
-    def picture(self, f):
-        return self.pictures[f]
+    @property
+    def lens(self):
+        return LENS
 
 
 def true_maps():
@@ -68,4 +64,5 @@ def toy_clip():
         codes = np.round(255 * encode_srgb(np.clip(image, 0, 1))).astype(np.uint8)
         mask = (views.coverage(camera) > 0.5).astype(np.uint8) * 255
         pictures.append(prepare_picture(codes, image.astype(np.float32), mask))
-    return ToyClip(mesh, poses, tuple(pictures))
+    views = Views.in_one_light(poses, LENS, SIZE, "head", pictures.__getitem__, None)
+    return ToyClip(views, Surface(mesh))

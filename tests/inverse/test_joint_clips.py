@@ -1,6 +1,7 @@
 """Clips of one head brought into one head space; and the tiny subject under two lights, from subject.yaml to report."""
 
 import json
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import cv2
@@ -14,8 +15,10 @@ from shared.contract.fields import field_faults
 from shared.contract.records import RUN, SOLVE, SOLVED_POSES
 from shared.errors import InputError
 from shared.geometry.mesh import interpolate, vertex_normals
+from shared.geometry.surface import Surface, TrackPoints
 from shared.geometry.transforms import Similarity, project, rigid, rotation_from_vector
 from shared.imaging.color import decode_transfer, encode_srgb
+from shared.imaging.views import Views
 from shared.inverse import joint_clips
 from shared.inverse.joint_clips import join_clips
 from shared.inverse.texture_match import ClipTexture, Matches, match_textures
@@ -46,32 +49,50 @@ def toy_clip(frames, widest, error_px, seed, second=False):
         poses = rigid(turn, (poses[:, :3, :3] @ MOVED.translation + poses[:, :3, 3]) / MOVED.scale)
         bent = MOVED.inverse_points(HEAD.vertices) + rng.normal(0.0, 0.3, HEAD.vertices.shape)
         points, mesh = MOVED.inverse_points(points), HEAD.replace(vertices=bent)
-    return SimpleNamespace(
-        mesh=mesh, camera_from_head=poses, intrinsics=LENS, size=(256, 256), moves="head", face_segment=None,
-        segment_names=(), frames=SimpleNamespace(source_name="clip.avi"), tracks=(points, np.full(400, error_px)),
-        picture=lambda f: (seed, f), chart_observations=lambda: ())
+    views = Views.in_one_light(poses, LENS, (256, 256), "head", lambda f: (seed, f), None)
+    surface = Surface(mesh, tracks=TrackPoints.tracked(points, np.full(400, error_px)))
+    return ToyInputs(views, surface)
+
+
+@dataclass(frozen=True)
+class ToyInputs:
+    """A clip as it lies on disk, as far as joining reads it."""
+
+    views: Views
+    surface: Surface
+    charts: tuple = ()
+    frames = SimpleNamespace(source_name="clip.avi")
+
+    def chart_observations(self):
+        return self.charts
+
+    def without_tracks(self):
+        return replace(self, surface=replace(self.surface, tracks=None))
 
 
 def test_poses_come_into_the_head_space_of_the_clip_that_knows_depth_best(monkeypatch):
     """Depth that the second clip got wrong does not enter, nor do some matches of other skin."""
     first, second = toy_clip(6, 0.5, 0.1, 0), toy_clip(4, 0.3, 0.2, 1, second=True)
     front = np.nonzero(HEAD.vertices[:, 2] > 20.0)[0]
-    there = second.mesh.vertices[front].copy()
+    there = second.surface.mesh.vertices[front].copy()
     there[::10] += 8.0
-    normals = vertex_normals(second.mesh.vertices, second.mesh.faces)[front]
+    normals = vertex_normals(second.surface.mesh.vertices, second.surface.mesh.faces)[front]
     matches = Matches(HEAD.vertices[front], there, normals)
     monkeypatch.setattr(joint_clips, "match_textures", lambda one, two: matches)
     for clips in ((first, second), (second, first)):
         joint = join_clips(clips, (None, None))
-        assert clips[joint.main] is first and joint.mesh is HEAD and joint.tracks is first.tracks
+        assert clips[joint.main] is first and joint.surface is first.surface and joint.surface.mesh is HEAD
         start = 0 if clips[0] is second else 6
         truth = project(HEAD.vertices, swing(4, 0.3), LENS)[0]
-        found = project(HEAD.vertices, joint.camera_from_head[start : start + 4], LENS)[0]
+        found = project(HEAD.vertices, joint.views.camera_from_head[start : start + 4], LENS)[0]
         assert np.abs(found - truth)[:, front].max() < 0.3
         assert np.linalg.norm(found - truth, axis=-1)[:, front].mean() < 0.1
-        assert joint.light_index.tolist() == [0] * len(clips[0].camera_from_head) + [1] * len(clips[1].camera_from_head)
-        pictures = [joint.picture(f) for f in range(10)]
-        assert pictures == [clip.picture(f) for clip in clips for f in range(len(clip.camera_from_head))]
+        assert joint.views.light_index.tolist() == [0] * len(clips[0].views) + [1] * len(clips[1].views)
+        pictures = [joint.views.picture(f) for f in range(10)]
+        assert pictures == [clip.views.picture(f) for clip in clips for f in range(len(clip.views))]
+        part = joint.views.take(np.array([1, 7, 9]))
+        assert [part.picture(k) for k in range(3)] == [pictures[f] for f in (1, 7, 9)]
+        assert np.array_equal(part.camera_from_head, joint.views.camera_from_head[[1, 7, 9]])
         said = joint.describe()
         assert [clip["mesh"] for clip in said] == [clip is first for clip in clips]
         assert said[start != 0]["matched_texels"] == len(front) and 0.0 < said[start != 0]["match_px"] < 0.8
@@ -108,23 +129,18 @@ def test_mean_textures_show_the_same_skin_where_they_are_shifted():
 
 
 def test_given_meshes_share_a_head_space_already():
-    clips = [toy_clip(4, 0.3, 0.1, seed) for seed in range(2)]
-    for clip in clips:
-        clip.tracks = None
+    clips = [toy_clip(4, 0.3, 0.1, seed).without_tracks() for seed in range(2)]
     joint = join_clips(clips, ())
-    assert joint.main == 0 and joint.tracks is None
-    assert np.array_equal(joint.camera_from_head, np.concatenate([clip.camera_from_head for clip in clips]))
+    assert joint.main == 0 and joint.surface.tracks is None
+    assert np.array_equal(joint.views.camera_from_head, np.concatenate([clip.views.camera_from_head for clip in clips]))
 
 
 def test_the_chart_of_the_first_clip_that_shows_one_counts():
     from shared.capture.chart import ChartObservation
 
-    clips = [toy_clip(4, 0.3, 0.1, seed) for seed in range(3)]
+    clips = [toy_clip(4, 0.3, 0.1, seed).without_tracks() for seed in range(3)]
     observation = ChartObservation(*(np.zeros(1) for _ in range(5)), frame=2, frame_index=7)
-    for clip in clips[1:]:
-        clip.chart_observations = lambda: (observation,)
-    for clip in clips:
-        clip.tracks = None
+    clips[1:] = [replace(clip, charts=(observation,)) for clip in clips[1:]]
     (found,) = join_clips(clips, ()).chart_observations()
     assert (found.frame, found.frame_index) == (6, 7)
 

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from toy_clip import FRAMES, LENS, MAP, SIZE, toy_clip, true_maps
+from toy_clip import FRAMES, MAP, toy_clip, true_maps
 
+from shared.compute.run_context import SILENT, RunContext
 from shared.contract.fields import field_faults, written_fields
 from shared.contract.job import Parameters
 from shared.contract.records import SOLVE
@@ -63,14 +64,14 @@ def test_it_finds_the_albedo(clip):
     def note(text):
         states.setdefault("notes", []).append(text)
 
-    first = solve_clip(clip, settings_of(clip, iterations=1), nothing, note)
+    first = solve_clip(clip.views, clip.surface, settings_of(clip, iterations=1), RunContext(nothing, note))
     seen = first.maps["confidence"] > 0.9
     assert 0.1 < seen.mean() < 0.8
-    result = solve_clip(clip, settings_of(clip, iterations=160), nothing, note)
+    result = solve_clip(clip.views, clip.surface, settings_of(clip, iterations=160), RunContext(nothing, note))
     before, after = (albedo_error(r.maps["diffuse_albedo"], seen) for r in (first, result))
     assert after < 0.6 * before and after < 0.11
     assert result.solution.fitted < 0.6 * first.solution.fitted
-    record = summarise(clip, result)
+    record = summarise(result, "head")
     assert np.nonzero(~result.fitted)[0].tolist() == [2, 6]
     assert np.isfinite([record["residuals"]["fitted"], record["residuals"]["held_out"]]).all()
     assert any("iteration 160" in line for line in states["notes"])
@@ -81,7 +82,7 @@ def test_a_run_that_was_cut_off_goes_on_as_if_it_had_not_been(clip, tmp_path):
     """Ten iterations, a checkpoint, ten more: the very numbers of twenty in one go. Other settings start anew."""
     path = tmp_path / "checkpoint.npz"
     notes = []
-    whole = solve_clip(clip, settings_of(clip, iterations=20), nothing, notes.append)
+    whole = solve_clip(clip.views, clip.surface, settings_of(clip, iterations=20), RunContext(nothing, notes.append))
 
     class CutOff(Exception):
         pass
@@ -94,14 +95,14 @@ def test_a_run_that_was_cut_off_goes_on_as_if_it_had_not_been(clip, tmp_path):
 
     options = {"iterations": 20, "checkpoint": path, "checkpoint_every": 10}
     with pytest.raises(CutOff):
-        solve_clip(clip, settings_of(clip, **options), cut, notes.append)
+        solve_clip(clip.views, clip.surface, settings_of(clip, **options), RunContext(cut, notes.append))
     assert path.is_file()
     other = settings_of(clip, **options, light_rate=0.05)
-    solve_clip(clip, other, nothing, notes.append)
+    solve_clip(clip.views, clip.surface, other, RunContext(nothing, notes.append))
     assert any("starts anew" in text for text in notes)
     with pytest.raises(CutOff):
-        solve_clip(clip, settings_of(clip, **options), cut, notes.append)
-    parts = solve_clip(clip, settings_of(clip, **options), nothing, notes.append)
+        solve_clip(clip.views, clip.surface, settings_of(clip, **options), RunContext(cut, notes.append))
+    parts = solve_clip(clip.views, clip.surface, settings_of(clip, **options), RunContext(nothing, notes.append))
     assert any("goes on from iteration 10" in text for text in notes)
     assert np.array_equal(parts.maps["diffuse_albedo"], whole.maps["diffuse_albedo"])
     assert np.array_equal(parts.solution.state.light, whole.solution.state.light)
@@ -112,16 +113,17 @@ def test_a_damaged_checkpoint_is_passed_over(clip, tmp_path):
     path = tmp_path / "checkpoint.npz"
     path.write_bytes(b"PK\x03\x04 nonsense")
     notes = []
-    solve_clip(clip, settings_of(clip, iterations=1, checkpoint=path), nothing, notes.append)
+    settings = settings_of(clip, iterations=1, checkpoint=path)
+    solve_clip(clip.views, clip.surface, settings, RunContext(nothing, notes.append))
     assert any("starts anew" in text for text in notes) and not path.exists()
 
 
 def test_vertices_move_towards_the_outline(clip):
     """The egg 3 % too small: mask and image losses pull its outline outwards."""
-    small = replace(clip, mesh=clip.mesh.replace(vertices=clip.mesh.vertices * 0.97))
+    small = replace(clip, surface=clip.surface.with_mesh(clip.mesh.replace(vertices=clip.mesh.vertices * 0.97)))
     changes = {"vertices": True, "iterations": 40, "pixels": 300, "vertex_rate": 0.3, "sampling": Sampling(8, 8, 4)}
-    result = solve_clip(small, settings_of(small, **changes), nothing, nothing)
-    record = summarise(small, result) | {"render_frames": [], "held_out_frames": []}
+    result = solve_clip(small.views, small.surface, settings_of(small, **changes))
+    record = summarise(result, "head") | {"render_frames": [], "held_out_frames": []}
     assert field_faults(record, SOLVE) == []
     assert {f"iterations[].{name}" for name in ("iteration", "image", "mask", "laplacian", "white_light", "diffuse",
                                                 "roughness_variation")} <= written_fields(record, SOLVE)
@@ -139,7 +141,7 @@ def test_light_models_are_those_of_the_transfer_solver(clip, model):
     """
     sampling = Sampling(16, 16, 8, visibility=model == "sun_sky")
     first, last = (
-        solve_clip(clip, settings_of(clip, light_model=model, iterations=count, sampling=sampling), nothing, nothing)
+        solve_clip(clip.views, clip.surface, settings_of(clip, light_model=model, iterations=count, sampling=sampling))
         for count in (1, 45)
     )
     assert last.solution.fitted < (0.95 if model == "camera" else 0.85) * first.solution.fitted
@@ -151,17 +153,17 @@ def test_the_other_methods_models_are_followed(clip, monkeypatch):
     its rays seeks the light."""
     changes = {"iterations": 3, "pixels": 100}
     matte = settings_of(clip, **changes, sampling=Sampling(8, 8, 4, specular=False))
-    assert (solve_clip(clip, matte, nothing, nothing).maps["specular_intensity"] == 0.0).all()
+    assert (solve_clip(clip.views, clip.surface, matte).maps["specular_intensity"] == 0.0).all()
     poses, three = [], replace(settings_of(clip, **changes), fit_frames=3)
-    fitted = frames_to_fit(clip, three, SurfaceViewer.of(clip.mesh))
-    solve_by_reference(clip, three, three.reference, fitted, nothing, nothing,
+    fitted = frames_to_fit(clip.views, clip.surface, three, SurfaceViewer.of(clip.mesh))
+    solve_by_reference(clip.views.with_fitted(fitted), clip.surface, three, three.reference, SILENT,
                        lambda solver, losses: poses.append(solver.views.camera_from_head))
-    assert len(poses) == 3 and all(np.array_equal(seen, clip.camera_from_head[fitted]) for seen in poses)
+    assert len(poses) == 3 and all(np.array_equal(seen, clip.views.camera_from_head[fitted]) for seen in poses)
     monkeypatch.setattr(Shader, "_open", None)
     unshadowed = settings_of(clip, **changes, sampling=Sampling(visibility=False))
-    assert np.isfinite(solve_clip(clip, unshadowed, nothing, nothing).maps["diffuse_albedo"]).all()
+    assert np.isfinite(solve_clip(clip.views, clip.surface, unshadowed).maps["diffuse_albedo"]).all()
     with pytest.raises(TypeError):
-        solve_clip(clip, settings_of(clip, **changes), nothing, nothing)
+        solve_clip(clip.views, clip.surface, settings_of(clip, **changes))
 
 
 def test_large_steps_are_a_change_of_variables(clip):
@@ -179,9 +181,9 @@ def test_few_frames_cover_the_face(clip):
     """Three of nine: one from either side and one between; they alone are fitted, the others judge."""
     viewer = SurfaceViewer.of(clip.mesh)
     front = clip.mesh.vertices[:, 2] > 10.0
-    chosen = covering_frames(viewer, front, clip.camera_from_head, LENS, SIZE, 3)
+    chosen = covering_frames(viewer, front, clip.views, 3)
     assert len(set(chosen.tolist())) == 3 and chosen[0] <= 1 and chosen[-1] >= FRAMES - 2
-    fitted = frames_to_fit(clip, InverseSettings(fit_frames=3), viewer)
+    fitted = frames_to_fit(clip.views, clip.surface, InverseSettings(fit_frames=3), viewer)
     assert fitted.sum() == 3 and len(fitted) == FRAMES
 
 
@@ -215,11 +217,11 @@ def test_the_stage_hands_its_parameters_on():
 
 def test_checkpoints_know_what_they_belong_to(clip):
     solver_settings = settings_of(clip).reference
-    from shared.published.solver import Start, Views
+    from shared.published.solver import Start
 
     maps = true_maps()
     start = Start(np.ones(3), maps["diffuse_albedo"], maps["specular_intensity"])
-    views = Views(clip.picture, clip.camera_from_head, LENS, SIZE, "head")
+    views = clip.views
     key = Checkpoint(solver_settings, start, views).key
     assert np.array_equal(key, Checkpoint(replace(solver_settings, iterations=999), start, views).key)
     assert not np.array_equal(key, Checkpoint(replace(solver_settings, seed=1), start, views).key)

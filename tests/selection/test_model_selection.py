@@ -20,6 +20,7 @@ from toy_head import toy_head
 
 from shared.appearance.fit import Solution
 from shared.appearance.problem import AppearanceSettings
+from shared.compute.run_context import SILENT, RunContext
 from shared.contract.fields import below, field_faults
 from shared.contract.job import Parameters
 from shared.contract.records import LADDER_TIMES, RUN, SOLVE
@@ -224,9 +225,9 @@ def test_a_model_becomes_the_solvers_settings():
 class Seen:
     """A clip's small captures as they are given, in the place of model_selection.SmallClip."""
 
-    def __init__(self, inputs, *_):
-        self.inputs, self.sizes = inputs, None
-        self.captures = {visible: inputs.capture for visible in (False, True)}
+    def __init__(self, views, surface, settings, chart, context, refined=None):
+        self.surface, self.refined, self.sizes = surface, refined, None
+        self.captures = {visible: surface.capture for visible in (False, True)}
         self.precomputed = dict.fromkeys(self.captures, SimpleNamespace(nodes=None))
 
 
@@ -238,31 +239,30 @@ def noisy(capture, sigma):
 MATTE = AppearanceSettings(resolutions=(8,), light_model="harmonics_2", specular=False, noise=(0.003, 0.01))
 
 
-def clip_of(capture):
-    return SimpleNamespace(capture=capture, mesh=None, face_segment=np.zeros(1), camera_from_head=np.zeros((14, 4, 4)))
+def seen_surface(capture, mesh=None):
+    return SimpleNamespace(capture=capture, mesh=mesh, face_segment=np.zeros(1))
 
 
 def select_meshes(monkeypatch, qualities, **settings):
     """What the clip's model selection leads to if a mesh of each number of subdivisions leaves so much noise."""
     capture, asked = make_truth(specular=0.0)[0], []
 
-    def refine_shape(tracked, frames, *, begun, **named):
+    def refine_shape(views, tracked, *, begun, **named):
         level = named["settings"].subdivisions
-        asked.append((level, begun and begun.mesh))
-        return SimpleNamespace(**{**vars(tracked), "capture": noisy(capture, qualities[1 + level]),
-                                  "mesh": f"level {level}", "stopped": 3 + level})
+        asked.append((level, begun and begun.surface.mesh))
+        surface = seen_surface(noisy(capture, qualities[1 + level]), f"level {level}")
+        return SimpleNamespace(surface=surface, stopped=3 + level)
 
     monkeypatch.setattr(model_selection, "SmallClip", Seen)
     monkeypatch.setattr(model_selection, "refine_shape", refine_shape)
-    monkeypatch.setattr(model_selection, "frames_of", lambda *_: None)
+    monkeypatch.setattr(model_selection, "some_views", lambda *_: None)
     whole = InverseSettings(appearance=MATTE, selection=frozenset(), shape=ShapeSettings(subdivisions=1), **settings)
-    fitted = np.ones(14, bool)
-    return select(clip_of(noisy(capture, qualities[0])), whole, fitted, None, None, lambda text: None), asked
+    return select(None, seen_surface(noisy(capture, qualities[0])), whole, None, SILENT), asked
 
 
 def test_the_mesh_is_refined_as_far_as_it_serves(one_thread, monkeypatch):
     selected, asked = select_meshes(monkeypatch, (0.02, 0.005, 0.02))
-    assert selected.inputs.mesh == "level 0" and selected.settings.shape is None
+    assert selected.surface.mesh == "level 0" and selected.settings.shape is None
     assert asked == [(0, None), (1, "level 0")]  # the second goes on where the first ended
     assert selected.shape_record["refined"] and selected.shape_record["stopped_vertices"] == 3
     assert selected.shape_record["held_out"]["after"] < 0.5 * selected.shape_record["held_out"]["before"]
@@ -274,7 +274,7 @@ def test_the_mesh_is_refined_as_far_as_it_serves(one_thread, monkeypatch):
 
 def test_a_tracked_mesh_that_no_refinement_improves_stays(one_thread, monkeypatch):
     selected, asked = select_meshes(monkeypatch, (0.01, 0.01, 0.005))
-    assert selected.inputs.mesh is None and selected.shape_record == {"refined": False}
+    assert selected.surface.mesh is None and selected.shape_record == {"refined": False}
     assert asked == [(0, None)]
 
 
@@ -282,8 +282,8 @@ def test_too_few_held_out_frames_choose_no_model(one_thread, monkeypatch):
     capture = make_truth(specular=0.0)[0]
     monkeypatch.setattr(model_selection, "SmallClip", Seen)
     notes, whole = [], InverseSettings(appearance=MATTE, selection=frozenset())
-    two = clip_of(replace(capture, fitted=np.arange(14) > 1))
-    selected = select(two, whole, np.ones(14, bool), None, None, notes.append)
+    two = seen_surface(replace(capture, fitted=np.arange(14) > 1))
+    selected = select(None, two, whole, None, RunContext(note=notes.append))
     assert selected.start is None and selected.candidates == () and selected.settings == replace(whole, selection=None)
     assert "2 frames are too few" in notes[0]
 

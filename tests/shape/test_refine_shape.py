@@ -15,21 +15,24 @@ from shared.contract.fields import below, field_faults
 from shared.contract.records import SOLVE
 from shared.geometry.mesh import Mesh, interpolate, normalised, tangent_frames, vertex_normals
 from shared.geometry.raycast import RayScene, camera_hits
+from shared.geometry.surface import TrackPoints
 from shared.geometry.transforms import projection_slope
 from shared.imaging.image_sampling import prepare_picture
-from shared.inverse.light_and_mesh import judge_shape
+from shared.imaging.views import Views
+from shared.inverse.solve import judge_shape
 from shared.rendering.envmap import cube_directions
 from shared.rendering.normal_derivatives import Reflections, shading_terms
 from shared.shape.equations import EquationSettings, variance_inflation
-from shared.shape.gauss_newton import Reflectance, ShapeClip, ShapedSurface, ShapeSettings, ShapeSolver
-from shared.shape.step import TrackPoints, large_step_metric, normal_turns, solve_offsets
+from shared.shape.gauss_newton import Reflectance, ShapedSurface, ShapeSettings, ShapeSolver
+from shared.shape.step import large_step_metric, normal_turns, solve_offsets
 
 
 @dataclass
 class Toy:
     start: Mesh
     truth: Mesh
-    clip: ShapeClip
+    views: Views
+    tracks: TrackPoints
     reflectance: Reflectance
 
 
@@ -57,13 +60,13 @@ def toy():
     fitted = np.arange(FRAMES) % 5 != 2
     known = np.nonzero((depth < 0.01) & (start.vertices[:, 2] > 20.0))[0][::3]
     tracks = TrackPoints(start.vertices[known], np.full(len(known), 0.15))
-    clip = ShapeClip(pictures.__getitem__, poses, LENS, fitted, "head", tracks)
+    views = Views.in_one_light(poses, LENS, (SIZE, SIZE), "head", pictures.__getitem__, None, fitted)
     known = Reflectance(light, SPECULAR, ROUGHNESS, precomputed.nodes, material.node_albedo)
-    return Toy(start, truth, clip, known)
+    return Toy(start, truth, views, tracks, known)
 
 
 def solver_of(toy, **changes):
-    return ShapeSolver(toy.clip, toy.reflectance, AppearanceSettings(), SIZES, ShapeSettings(**changes))
+    return ShapeSolver(toy.views, toy.tracks, toy.reflectance, AppearanceSettings(), SIZES, ShapeSettings(**changes))
 
 
 def test_projection_slope_is_the_derivative_of_the_projection():

@@ -39,7 +39,7 @@ def map_errors(
         inside = read_png(Path(f"{stem}_mask.png")) > 127
         row, column = np.nonzero(inside)
         intrinsics = inputs.frames.intrinsics_source
-        seen = viewer.view(inputs.camera_from_head[place[int(frame)]], intrinsics, np.stack([column, row], 1))
+        seen = viewer.view(inputs.views.camera_from_head[place[int(frame)]], intrinsics, np.stack([column, row], 1))
         hit = seen["coverage"] > 0.5
         confidence.append(seen["confidence"][hit].ravel())
         for name, field in fields.items():
@@ -104,24 +104,22 @@ def render_errors(subject: Path, inputs: ClipInputs, result: InverseResult) -> d
     """sRGB-coded PSNR of re-renders against the video's own frames on the face skin, fitted and held out."""
     truth_mesh, mask = read_obj(subject / "gt" / "mesh.obj"), read_exr(subject / "gt" / "mask.exr")
     poses = load_arrays(subject / "gt" / "poses.npz")["camera_from_head"]
-    scene = RayScene(truth_mesh.vertices, truth_mesh.faces)
+    scene, views = RayScene(truth_mesh.vertices, truth_mesh.faces), inputs.views
     maps = SurfaceMaps(*(result.maps[name] for name in ("diffuse_albedo", "specular_intensity")))
     errors: dict[str, list] = {"fitted": [], "held_out": []}
     for name, chosen in (("fitted", result.fitted), ("held_out", ~result.fitted)):
-        index = np.nonzero(chosen[: len(inputs.camera_from_head)])[0]
+        index = np.nonzero(chosen[: len(views)])[0]
         for f in index[np.unique(np.linspace(0, len(index) - 1, RENDERED_FRAMES).astype(int))]:
-            frame, pose = int(inputs.frames.frame_index[inputs.place[f]]), inputs.camera_from_head[f]
-            face, bary, _ = camera_hits(scene, poses[frame], inputs.intrinsics, *inputs.size)
+            frame, pose = int(inputs.frame_index[f]), views.camera_from_head[f]
+            face, bary, _ = camera_hits(scene, poses[frame], inputs.lens, *views.size)
             hit = face >= 0
             uv = interpolate(truth_mesh.uvs, truth_mesh.face_uvs, face[hit], bary[hit])
             skin = np.zeros(face.shape, bool)
             skin[hit] = sample_bilinear(mask, uv).reshape(len(uv), -1)[:, 0] > 0.5
             skin = cv2.erode(skin.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-            image, coverage = render_frame(
-                result.viewer, result.shading, maps, f, pose, inputs.intrinsics, inputs.size
-            )
+            image, coverage = render_frame(result.viewer, result.shading, maps, f, pose, inputs.lens, views.size)
             seen = skin & (coverage > 0.99)
-            video = inputs.picture(f).levels[0]
+            video = views.picture(f).levels[0]
             difference = encode_srgb(np.clip(video[seen], 0, 1)) - encode_srgb(np.clip(image[seen], 0, 1))
             errors[name].append((float(np.square(difference).sum()), difference.size))
     mean = {name: np.sum(parts, 0) for name, parts in errors.items()}

@@ -1,0 +1,87 @@
+"""The frames of a clip, or of several clips of one head in a row, as solvers see them: cameras, lights, pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from shared.imaging.frame_index import frames_of_lights
+from shared.imaging.image_sampling import Picture
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """F frames of one head.
+
+    camera_from_head [F, 4, 4] mm; intrinsics [F, 3, 3] px of pictures of size (width, height); moves: "head" or
+    "camera", what moved against the light; light_index [F] int: which light each frame stands in, 0 first, frames of
+    one light in a row; fitted [F] bool: the other frames are held out; read_picture(f), read_mask(f): see picture and
+    mask.
+    """
+
+    camera_from_head: np.ndarray
+    intrinsics: np.ndarray
+    size: tuple[int, int]
+    moves: str
+    light_index: np.ndarray
+    fitted: np.ndarray
+    read_picture: Callable[[int], Picture]
+    read_mask: Callable[[int], np.ndarray]
+
+    @classmethod
+    def in_one_light(
+        cls,
+        camera_from_head: np.ndarray,
+        lens: np.ndarray,
+        size: tuple[int, int],
+        moves: str,
+        read_picture: Callable[[int], Picture],
+        read_mask: Callable[[int], np.ndarray],
+        fitted: np.ndarray | None = None,
+    ) -> Views:
+        """All in one light through one lens [3, 3] px; fitted [F] bool, None: all; the others as of the class."""
+        count = len(camera_from_head)
+        return cls(
+            camera_from_head=camera_from_head,
+            intrinsics=np.broadcast_to(lens, (count, 3, 3)),
+            size=size,
+            moves=moves,
+            light_index=np.zeros(count, int),
+            fitted=np.ones(count, bool) if fitted is None else fitted,
+            read_picture=read_picture,
+            read_mask=read_mask,
+        )
+
+    def __len__(self) -> int:
+        return len(self.camera_from_head)
+
+    def picture(self, f: int) -> Picture:
+        """Frame f, decoded and ready for sampling."""
+        return self.read_picture(int(f))
+
+    def mask(self, f: int) -> np.ndarray:
+        """Frame f's mask [H, W] uint8, 0: background."""
+        return self.read_mask(int(f))
+
+    @property
+    def frames_of_lights(self) -> list[np.ndarray]:
+        """Of each light, the indices of its frames."""
+        return frames_of_lights(self.light_index, len(self))
+
+    def with_fitted(self, fitted: np.ndarray) -> Views:
+        """The same with other frames fitted [F] bool."""
+        return replace(self, fitted=fitted)
+
+    def take(self, frames: np.ndarray, fitted: np.ndarray | None = None) -> Views:
+        """Some frames [K], indices, and which of them are fitted [K] bool; None: those that were."""
+        return replace(
+            self,
+            camera_from_head=self.camera_from_head[frames],
+            intrinsics=self.intrinsics[frames],
+            light_index=self.light_index[frames],
+            fitted=self.fitted[frames] if fitted is None else fitted,
+            read_picture=lambda k: self.picture(frames[k]),
+            read_mask=lambda k: self.mask(frames[k]),
+        )
