@@ -12,6 +12,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 INSTALL := $(BIN)/python -m pip install --quiet --require-hashes --no-deps --no-build-isolation
+# Two files of tests at a time: together they take up to 4 GB.
+SIDE_BY_SIDE := --numprocesses 2 --dist loadfile
 CASES ?= quick
 OUT ?= build/chart
 SEED ?= $(shell date +%s)
@@ -38,13 +40,13 @@ demo: setup
 	$(BIN)/python -m tools.demo
 
 test: setup lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE)
 
 test-all: setup lint
 	$(BIN)/python -m tools.setup.test_all
 
 test-random: setup
-	$(BIN)/python -m pytest --order-seed $(SEED)
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) --order-seed $(SEED)
 
 test-files: setup
 	tools/setup/test_files.sh

@@ -1,6 +1,7 @@
 """The tests' own shapes can be imported; the tiny subject runs once for all tests that need it."""
 
 import atexit
+import fcntl
 import os
 import sys
 from pathlib import Path
@@ -14,11 +15,20 @@ pytest_plugins = ["random_order"]
 
 
 @pytest.fixture(scope="session")
-def tiny_run(tmp_path_factory):
-    """The folder (work/ and export/) of the tiny subject, from clip to export."""
-    from tools.goldens.tiny import run_tiny
+def tiny_run(tmp_path_factory, worker_id):
+    """The folder (work/ and export/) of the tiny subject, from clip to export; made once for all workers."""
+    from tools.goldens.tiny import TINY_SUBJECT, run_tiny
 
-    return run_tiny(tmp_path_factory.mktemp("tiny_run"))
+    if worker_id == "master":
+        return run_tiny(tmp_path_factory.mktemp("tiny_run"))
+    folder = tmp_path_factory.getbasetemp().parent / "tiny_run"
+    with open(folder.with_suffix(".lock"), "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        done = folder / "done"
+        if not done.exists():
+            run_tiny(folder)
+            done.touch()
+    return folder / TINY_SUBJECT.name
 
 
 @atexit.register
