@@ -107,9 +107,9 @@ def run(job: Job) -> None:
     palette = np.array([colours[name]["albedo"] for name in names], np.float32)
     filled = np.where((weight > 0)[:, None], mean, palette[texel_segment])
     mean_image = texels.dilated(texels.to_image(filled))
-    linear = {"colour_space": "lin_rec709_scene"}
-    write_exr(job.out / "mean_texture.exr", mean_image, **linear)
-    write_exr(job.out / "segment_albedo.exr", texels.dilated(texels.to_image(palette[texel_segment])), **linear)
+    segment_image = texels.dilated(texels.to_image(palette[texel_segment]))
+    write_exr(job.out / "mean_texture.exr", mean_image, colour_space="lin_rec709_scene")
+    write_exr(job.out / "segment_albedo.exr", segment_image, colour_space="lin_rec709_scene")
     write_exr(job.out / "weight.exr", texels.to_image(weight), colour_space="data")
     write_png(job.out / "segments.png", borders_picture(mean_image, texels.to_image(texel_segment, 255)))
     frames_used = min(len(inputs.frame_index), job.params.frames)

@@ -56,13 +56,18 @@ class SpecularVariation:
 
     def worn_by(self, solution: Solution) -> Solution:
         """A solution of the same model, with roughness and specular intensity that vary about its own values."""
-        state, found = solution.state, {}
-        for name, equations in (("local_roughness_fit", self.roughness_equations),
-                                ("local_specular", self.specular_equations)):
-            if equations is not None:
-                logs = equations.logs - equations.logs.mean() + np.log(state.roughness)
-                found[name] = replace(equations, logs=logs, specular=(state.specular, equations.specular[1]))
-        return replace(solution, roughness_record={"chosen": self.roughness}, **found)
+        state = solution.state
+
+        def about(equations: SpecularEquations | None) -> SpecularEquations | None:
+            if equations is None:
+                return None
+            logs = equations.logs - equations.logs.mean() + np.log(state.roughness)
+            return replace(equations, logs=logs, specular=(state.specular, equations.specular[1]))
+
+        return replace(
+            solution, roughness_record={"chosen": self.roughness},
+            local_roughness_fit=about(self.roughness_equations), local_specular=about(self.specular_equations),
+        )
 
 
 class SpecularSelection:
@@ -113,7 +118,8 @@ class SpecularSelection:
                     missed += 1
                 if missed == LOOK_AHEAD:
                     break
-        return SpecularVariation(**chosen, **{f"{part}_equations": self.pools[name] for part, name in chosen.items()})
+        specular, roughness = chosen["specular"], chosen["roughness"]
+        return SpecularVariation(specular, roughness, self.pools[specular], self.pools[roughness])
 
     def _try(self, chosen: Mapping[str, str]) -> Trial:
         begun, problem, state = time.perf_counter(), self.problem, self.state

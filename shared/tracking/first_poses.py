@@ -19,6 +19,7 @@ from shared.geometry.transforms import camera_centres, project, rigid
 from shared.tracking.bundle import BundleSolution, Tracks, adjust, place_points
 from shared.tracking.fit_head import HeadFit, triangulate
 from shared.tracking.head_model import HeadModel
+from shared.tracking.motion_prior import MotionPrior
 from shared.tracking.pnp import pose_from_points
 from shared.tracking.tracked_clip import TrackedClip
 from shared.tracking.tracks import (
@@ -253,12 +254,15 @@ def adjust_clip(
     points: np.ndarray,
     prior_mm: float,
     loss_scale: float = LOSS,
-    **more,
+    motion: MotionPrior | None = None,
 ) -> BundleSolution:
-    """Bundle adjustment, of the points alone where the clip's poses are held; **more goes to `adjust`."""
+    """Bundle adjustment from poses [F, 4, 4] and points [N, 3] mm, of the points alone where the clip's poses are held;
+    the rest as for bundle.adjust."""
     if clip.hold_poses:
         return place_points(tracks, poses, points, clip.intrinsics, loss_scale=loss_scale, prior_mm=prior_mm)
-    return adjust(tracks, poses, points, clip.intrinsics, loss_scale=loss_scale, prior_mm=prior_mm, **more)
+    return adjust(
+        tracks, poses, points, clip.intrinsics, loss_scale=loss_scale, prior_mm=prior_mm, motion=motion
+    )
 
 
 def enough_observations(tracks: Tracks, points: np.ndarray) -> tuple[Tracks, np.ndarray, np.ndarray]:

@@ -56,9 +56,10 @@ def look_elsewhere(
 
     def solve(gain: float) -> tuple[float, BundleSolution]:
         lens, start = zoomed(intrinsics, gain), farther(poses, points, gain)
-        options = {"loss_scale": loss_scale, "prior_mm": PRIOR_MM}
-        solved = adjust(thin, start, points, lens, max_iterations=ITERATIONS, **options)
-        problem = BundleProblem(thin, points, lens, **options)
+        solved = adjust(
+            thin, start, points, lens, loss_scale=loss_scale, prior_mm=PRIOR_MM, max_iterations=ITERATIONS
+        )
+        problem = BundleProblem(thin, points, lens, loss_scale=loss_scale, prior_mm=PRIOR_MM)
         return problem.cost(BundleState(solved.camera_from_points, solved.points)), solved
 
     costs = np.array([solve(gain)[0] for gain in GAINS])
