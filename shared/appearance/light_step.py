@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.sparse.linalg import LinearOperator, cg
 
 from shared.appearance.albedo_scale import resolve_scale
 from shared.appearance.problem import AppearanceProblem, AppearanceState
@@ -42,32 +43,6 @@ _CONVERGED = 0.03
 PRECISION_OF_SEVERAL = (60, 0.002)
 """Settings.precision where there are several lights. One light's errors against another's, with an albedo between them,
 are what the samples tell least of, and come last: steps that stop before leave them in the albedo."""
-
-
-def conjugate_gradients(
-    product: Callable[[np.ndarray], np.ndarray], right: np.ndarray, count: int, tolerance: float = 0.02
-) -> np.ndarray:
-    """Approximate solution, of right's shape, of product(x) = right by conjugate gradients, at most count products.
-
-    Ends when the residual has fallen by the tolerance. Ended long before, what remains hangs on roundings: 1e-7 in
-    products of single precision comes out as 1e-2.
-    """
-    x, residual = np.zeros_like(right), right.copy()
-    direction, power = residual.copy(), float((residual * residual).sum())
-    first = power
-    for _ in range(count):
-        image = product(direction)
-        curvature = float((direction * image).sum())
-        if curvature <= 0.0:
-            break
-        length = power / curvature
-        x += length * direction
-        residual -= length * image
-        power, last = float((residual * residual).sum()), power
-        if power <= tolerance**2 * first:
-            break
-        direction = residual + (power / last) * direction
-    return x
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,9 +216,13 @@ class LinearisedFit:
 
         several = len(self.errors.light_frames) > 1
         count, tolerance = PRECISION_OF_SEVERAL if several else self.problem.settings.precision
-        whole = level(conjugate_gradients(
-            lambda x: level_transposed(self.product(level(x))), -level_transposed(self.gradient()), count, tolerance
-        ))
+        hessian = LinearOperator(
+            (params.size, params.size), dtype=np.float64,
+            matvec=lambda x: level_transposed(self.product(level(x.reshape(params.shape)))).ravel(),
+        )
+        # Ended long before, what remains hangs on roundings: 1e-7 in products of single precision comes out as 1e-2.
+        solved, _ = cg(hessian, -level_transposed(self.gradient()).ravel(), rtol=tolerance, atol=0.0, maxiter=count)
+        whole = level(solved.reshape(params.shape))
         longest = max(whole.max() / _LARGEST_RISE, -whole.min() / _LARGEST_FALL, 1.0)
         steps = [whole]
         if longest > 1.0:

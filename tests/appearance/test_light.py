@@ -1,4 +1,4 @@
-"""The light's operators and priors, the scale between light and albedo, the linear solver and the choice of frames."""
+"""The light's operators and priors, the scale between light and albedo, and the choice of frames."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,6 @@ from shared.appearance.albedo_scale import (
 )
 from shared.appearance.light import FrameLight, LightPriors, LogPrior, resample_light
 from shared.appearance.light_models import make_light_model, real_harmonics
-from shared.appearance.light_step import conjugate_gradients
 from shared.geometry.transforms import fibonacci_sphere, rotation_from_vector
 from shared.imaging.color import LUMINANCE
 from shared.imaging.frame_index import hold_out, spread_frames
@@ -186,15 +185,6 @@ def test_skin_locus_runs_through_the_reference_skins():
     residual = chroma - locus.offset - luminance[:, None] * locus.slope
     assert np.allclose(residual.sum(0), 0.0, atol=1e-9) and np.allclose(luminance @ residual, 0.0, atol=1e-9)
     assert (np.abs(residual) < 3.0 * locus.sigma).all()
-
-
-def test_conjugate_gradients_solve():
-    rng = np.random.default_rng(2)
-    root = rng.normal(size=(12, 12))
-    matrix = root @ root.T + np.eye(12)
-    right = rng.normal(size=12)
-    found = conjugate_gradients(lambda x: matrix @ x, right, 60, tolerance=1e-10)
-    assert np.allclose(found, np.linalg.solve(matrix, right), atol=1e-6)
 
 
 def test_frames_are_spread_and_held_out_evenly():
