@@ -69,6 +69,15 @@ def vertex_adjacency(faces: np.ndarray, count: int) -> sparse.csr_matrix:
     return ((adjacency + adjacency.T) > 0).astype(np.float64)
 
 
+def graph_laplacian(faces: np.ndarray, count: int) -> sparse.csr_matrix:
+    """[F, 3] -> [count, count]: D - A, so that L @ x is each vertex, as often as it has neighbours, minus their sum.
+
+    Symmetric. A: vertex_adjacency; D: diagonal, the number of neighbours.
+    """
+    adjacency = vertex_adjacency(faces, count)
+    return (sparse.diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency).tocsr()
+
+
 def uniform_laplacian(faces: np.ndarray, count: int) -> sparse.csr_matrix:
     """[F, 3] -> [count, count]: I - D^-1 A, so that L @ x is each vertex minus the mean of its neighbours."""
     adjacency = vertex_adjacency(faces, count)

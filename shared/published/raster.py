@@ -19,6 +19,7 @@ import torch
 
 from shared.geometry.mesh import Mesh, face_normals
 from shared.geometry.raycast import RayScene, camera_hits, pixel_directions
+from shared.geometry.transforms import camera_centres
 
 NEAR_MM = 0.5
 """A pixel's surface lies behind an edge when it is deeper than it by this much."""
@@ -109,9 +110,8 @@ class Raster:
         face: np.ndarray,
     ) -> SurfacePoints:
         """The surface behind flat pixel indices [P] that see these faces [P]; normals [V, 3] of the vertices."""
-        rotation, translation = camera_from_head[:3, :3], camera_from_head[:3, 3]
-        origin = self._tensor(-translation @ rotation)
-        direction = self._tensor(self._rays[pixels] @ rotation)
+        origin = self._tensor(camera_centres(camera_from_head))
+        direction = self._tensor(self._rays[pixels] @ camera_from_head[:3, :3])
         index = torch.from_numpy(face.astype(np.int64)).to(self._device)
         a, b, c = vertices[self._faces[index]].unbind(1)
         # ray against triangle [Moeller1997]
@@ -138,8 +138,8 @@ class Raster:
 
     def _project_silhouette(self, vertices: np.ndarray, camera_from_head: np.ndarray):
         """Pixels [E, 2, 2], depth [E, 2] and vertices [E, 2] of the edges between a front and a back face."""
-        centre = -camera_from_head[:3, 3] @ camera_from_head[:3, :3]
-        facing = ((centre - vertices[self.faces[:, 0]]) * face_normals(vertices, self.faces)).sum(1) > 0
+        towards = camera_centres(camera_from_head) - vertices[self.faces[:, 0]]
+        facing = (towards * face_normals(vertices, self.faces)).sum(1) > 0
         one, other = self._edge_faces.T
         edges = self._edges[(other >= 0) & (facing[one] != facing[other])]
         seen = vertices[edges] @ camera_from_head[:3, :3].T + camera_from_head[:3, 3]

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shared.capture.landmarks import LANDMARK_COUNT, OVAL, FaceNetworks
-from shared.compute.robust import ROBUST_SCALE
+from shared.compute.robust import ROBUST_SCALE, cauchy_weight
 from shared.geometry.mesh import interpolate, normalised, vertex_normals
 from shared.geometry.raycast import RayScene, camera_hits
 from shared.geometry.transforms import rigid, rotation_from_vector
@@ -71,7 +71,7 @@ def embed_landmarks(model: HeadModel, topology: HeadTopology, networks: FaceNetw
     face, bary = _closest(fine, np.repeat(topology.part == SKIN, 16), middle)
     for _ in range(2):
         face, bary = parent_location(face, bary)
-    weight = 1 / (1 + (spread / SPREAD_MM) ** 2)
+    weight = cauchy_weight(spread, SPREAD_MM)
     weight[list(OVAL)] = 0
     weight[spread > MAX_SPREAD_MM] = 0
     return Embedding(face, bary, weight, spread, np.array(scores))

@@ -72,13 +72,6 @@ def rings_around(topology: HeadTopology, parts: tuple[int, ...], count: int) -> 
     return np.repeat(ring, 2)
 
 
-def triangle_adjacency(faces: np.ndarray, vertex_count: int) -> sparse.csr_matrix:
-    """[V, V] symmetric 0/1 adjacency of a triangle mesh."""
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    matrix = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count,) * 2)
-    return ((matrix + matrix.T) > 0).astype(np.float64).tocsr()
-
-
 def boundary_loop(faces: np.ndarray) -> np.ndarray:
     """The vertices along the rim of a surface with one boundary, in the order of its faces' orientation."""
     half_edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
