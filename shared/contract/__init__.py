@@ -11,8 +11,8 @@ May import: errors.
 """
 
 from shared.contract.cli import main
-from shared.contract.declare import Output, Parameter, Stage
+from shared.contract.declare import Output, Parameter, ParameterGroup, Stage
 from shared.contract.job import Job
 from shared.contract.subject import Subject, load_subject
 
-__all__ = ["Job", "Output", "Parameter", "Stage", "Subject", "load_subject", "main"]
+__all__ = ["Job", "Output", "Parameter", "ParameterGroup", "Stage", "Subject", "load_subject", "main"]

@@ -29,7 +29,7 @@ class Parameters:
         return f"Parameters({self.__dict__})"
 
     def as_dict(self) -> dict[str, object]:
-        """{name: value}, the seed included."""
+        """{name: value}."""
         return dict(self.__dict__)
 
 
@@ -37,8 +37,8 @@ class Job:
     """One run of one stage.
 
     subject: facts of subject.yaml; of several clips, of the one that this run is about, or of all. params: the stage's
-    parameters, `seed` included. out: the folder to write into; it is published when run and check have returned.
-    threads: cores the stage may use.
+    parameters. out: the folder to write into; it is published when run and check have returned. threads: cores the
+    stage may use.
     """
 
     def __init__(self, stage: Stage, subject: Subject, params: Mapping[str, object], out: Path, run: RunFolder,

@@ -288,7 +288,6 @@ MANIFEST = (
     Field("stage", "The stage's name.", "text"),
     Field("version", "Its version.", "int"),
     Field("parameters.**", "Its parameters as used.", ""),
-    Field("seed", "The seed of its random choices.", "int"),
     Field("inputs", "SHA-256 of all that it read, by name.", ""),
     Field("inputs.<name>", "Of a stage, over all of its files.", "text"),
     Field("key", "SHA-256 of all of the above: equal keys, equal results.", "text"),

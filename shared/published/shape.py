@@ -48,15 +48,15 @@ class _Solved(torch.autograd.Function):
 
 
 def _on_cpu(solve, values: torch.Tensor) -> torch.Tensor:
-    solved = solve(values.detach().cpu().double().numpy())
-    return torch.from_numpy(solved).to(values.device, values.dtype)
+    solved = solve(values.detach().double().numpy())
+    return torch.from_numpy(solved).to(values.dtype)
 
 
 class LaplacianLoss:
     """Mean squared distance of vertices from the mean of their neighbours, in UNIT_MM."""
 
-    def __init__(self, faces: np.ndarray, count: int, device="cpu", dtype=torch.float32):
-        self._operator = SparseOperator(uniform_laplacian(faces, count), device, dtype)
+    def __init__(self, faces: np.ndarray, count: int, dtype=torch.float32):
+        self._operator = SparseOperator(uniform_laplacian(faces, count), dtype)
 
     def __call__(self, vertices: torch.Tensor) -> torch.Tensor:
         return (self._operator(vertices) / UNIT_MM).square().sum(1).mean()

@@ -78,8 +78,11 @@ def _shown(value: object) -> str:
 
 
 def parameter_sections(stages: Sequence[Stage]) -> str:
-    """Every stage's parameters, as `limn parameters` lists them."""
-    return "\n".join(f"## {stage.name}\n\n{stage.help}\n\n{parameter_table([stage])}" for stage in stages)
+    """Every stage's parameters, as `limn parameters` lists them; groups that count in one case only at the end."""
+    sections = [f"## {stage.name}\n\n{stage.help}\n\n{parameter_table({stage.name: stage.common})}" for stage in stages]
+    sections += [f"## {stage.name}: {group.name}\n\nParameters {group.case}.\n\n"
+                 f"{parameter_table({stage.name: group.parameters})}" for stage in stages for group in stage.groups]
+    return "\n".join(sections)
 
 
 # ---------------------------------------------------------------------- files
