@@ -12,6 +12,9 @@ from embreex.mesh_construction import TriangleMesh
 
 from shared.geometry.transforms import camera_centres
 
+RAY_START_MM = 0.05
+"""How far above a surface rays start that must not meet it again."""
+
 
 class RayScene:
     """An acceleration structure over vertices [V, 3] and faces [F, 3]."""

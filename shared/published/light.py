@@ -21,6 +21,8 @@ from shared.rendering.envmap import cube_directions, cube_solid_angles, cube_tex
 from shared.rendering.split_sum import frames_about, sample_half_vectors
 
 LEAST_ROUGHNESS, ROUGH_LEVEL = 0.08, 0.5
+FLOOR = 0.05
+"""Of the mean brightness, in every direction that light is sampled from: dark texels are looked at, too."""
 _IRRADIANCE_EDGE = 16
 _ROWS_AT_ONCE = 30_000
 # Of each face (+x -x +y -y +z -z): which component points right and down in it, and its sign (see
@@ -203,10 +205,10 @@ class PrefilteredLight:
 class LightSampling:
     """Directions in proportion to the light's brightness, uniform within a texel, and the density of any direction."""
 
-    def __init__(self, light: torch.Tensor, floor: float = 0.05):
+    def __init__(self, light: torch.Tensor):
         self.resolution = round((len(light) / 6) ** 0.5)
         brightness = light.detach().mean(1).double()
-        brightness = brightness + floor * brightness.mean().clamp_min(1e-9)
+        brightness = brightness + FLOOR * brightness.mean().clamp_min(1e-9)
         solid = torch.from_numpy(cube_solid_angles(self.resolution))
         weight = brightness * solid
         self._share = weight / weight.sum()
@@ -238,10 +240,10 @@ class LightSampling:
 
 
 @lru_cache(maxsize=1)
-def energy_table(cosines: int = 64, roughnesses: int = 48) -> np.ndarray:
-    """[2, roughnesses, cosines]: the split sum's A and B on a grid of cell centres over n.o and roughness in 0 .. 1."""
-    cosine = (np.arange(cosines) + 0.5) / cosines
-    rough = np.maximum((np.arange(roughnesses) + 0.5) / roughnesses, 0.02)
+def energy_table() -> np.ndarray:
+    """[2, 48, 64]: the split sum's A and B on a grid of cell centres over roughness and n.o in 0 .. 1."""
+    cosine = (np.arange(64) + 0.5) / 64
+    rough = np.maximum((np.arange(48) + 0.5) / 48, 0.02)
     return np.stack([microfacet_integrals(cosine, r)[1:] for r in rough], axis=1)
 
 

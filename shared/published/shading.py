@@ -17,12 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from shared.geometry.raycast import RayScene
+from shared.geometry.raycast import RAY_START_MM, RayScene
 from shared.published.light import CubeSampler, LightSampling, PrefilteredLight, split_sum_energy
 from shared.published.raster import SurfacePoints
 from shared.rendering.brdf import F0
 
-OFFSET_MM = 0.05
 _PIXELS_AT_ONCE = 4000
 
 
@@ -144,7 +143,7 @@ class Shader:
     def _open(self, position, normal, directions, wanted, scene: RayScene, turn) -> torch.Tensor:
         """[P, S] bool: directions [P, S, 3] of the light's space, where wanted, that meet nothing. Rays on the CPU."""
         pixel, sample = torch.nonzero(wanted, as_tuple=True)
-        offset = (position + OFFSET_MM * (normal @ turn)).detach()
+        offset = (position + RAY_START_MM * (normal @ turn)).detach()
         rays = (directions[pixel, sample] @ turn).detach()
         hidden = scene.occluded(offset[pixel].cpu().numpy(), rays.cpu().numpy())
         result = torch.zeros(wanted.shape, dtype=torch.bool)

@@ -55,8 +55,8 @@ def _on_cpu(solve, values: torch.Tensor) -> torch.Tensor:
 class LaplacianLoss:
     """Mean squared distance of vertices from the mean of their neighbours, in UNIT_MM."""
 
-    def __init__(self, faces: np.ndarray, count: int, dtype=torch.float32):
-        self._operator = SparseOperator(uniform_laplacian(faces, count), dtype)
+    def __init__(self, faces: np.ndarray, count: int):
+        self._operator = SparseOperator(uniform_laplacian(faces, count))
 
     def __call__(self, vertices: torch.Tensor) -> torch.Tensor:
         return (self._operator(vertices) / UNIT_MM).square().sum(1).mean()

@@ -50,15 +50,15 @@ class ReferenceSolver:
     """Fits all views, which share one lens. Parameters are torch leaves by name: vertices (large-steps space), light,
     albedo, specular, roughness."""
 
-    def __init__(self, mesh: Mesh, views: Views, start: Start, settings: ReferenceSettings, dtype=torch.float32):
-        self.mesh, self.views, self.settings, self.dtype = mesh, views, settings, dtype
+    def __init__(self, mesh: Mesh, views: Views, start: Start, settings: ReferenceSettings):
+        self.mesh, self.views, self.settings = mesh, views, settings
         few = settings.light_model != "cubemap"
         self.light_model = make_light_model(settings.light_model, MODEL_RESOLUTION) if few else None
         resolution = MODEL_RESOLUTION if few else settings.resolution
-        self.raster = Raster(mesh, views.intrinsics[0], views.size, dtype)
-        self.shader = Shader(resolution, settings.sampling, min(settings.smallest, resolution), dtype)
+        self.raster = Raster(mesh, views.intrinsics[0], views.size)
+        self.shader = Shader(resolution, settings.sampling, min(settings.smallest, resolution))
         self.steps = LargeSteps(mesh.faces, len(mesh.vertices), settings.smoothing)
-        self.laplacian = LaplacianLoss(mesh.faces, len(mesh.vertices), dtype)
+        self.laplacian = LaplacianLoss(mesh.faces, len(mesh.vertices))
         self._faces = torch.from_numpy(mesh.faces.astype(np.int64))
         self.parameters = self._start(start, resolution)
         self.optimiser = torch.optim.Adam(self._groups())
@@ -77,7 +77,7 @@ class ReferenceSolver:
             "specular": start.specular_intensity,
             "roughness": np.full(start.specular_intensity.shape, self.settings.roughness),
         }
-        tensors = {name: torch.tensor(array, dtype=self.dtype) for name, array in arrays.items()}
+        tensors = {name: torch.tensor(array, dtype=torch.float32) for name, array in arrays.items()}
         fixed = () if self.settings.vertices else ("vertices",)
         fixed += () if self.settings.sampling.specular else ("specular", "roughness")
         return {name: tensor.requires_grad_(name not in fixed) for name, tensor in tensors.items()}
@@ -206,7 +206,7 @@ class ReferenceSolver:
         return ((coverage - self._tensor(person.astype(np.float64))).abs() * self._tensor(near_border * 1.0)).mean()
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array)).to(self.dtype)
+        return torch.from_numpy(np.ascontiguousarray(array)).to(torch.float32)
 
     # ------------------------------------------------------------------ descent
     def total(self, losses: dict[str, torch.Tensor]) -> torch.Tensor:
