@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import scipy.sparse as sparse
 
-from shared.geometry.mesh import Mesh, face_normals, vertex_normals
+from shared.geometry.mesh import Mesh, face_normals, half_edges, vertex_normals
 from shared.geometry.raycast import RAY_START_MM, RayScene
 from shared.geometry.transforms import project
 
@@ -86,8 +86,7 @@ class SurfaceViewer:
         self.error_mm, self.least_cosine = 0.0, MINIMUM_VIEW_COSINE
         self.normals = vertex_normals(mesh.vertices, mesh.faces)
         self._vertices, self._normals = mesh.vertices, self.normals
-        faces = mesh.faces
-        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        edges = half_edges(mesh.faces)
         length = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
         self.rings = max(1, round(margin_mm / float(np.median(length))))
         shape = (len(mesh.vertices),) * 2

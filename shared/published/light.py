@@ -18,7 +18,7 @@ import torch
 
 from shared.rendering.brdf import MINIMUM_COSINE, microfacet_integrals
 from shared.rendering.envmap import cube_directions, cube_solid_angles, cube_texel, padded_cube_index
-from shared.rendering.split_sum import frames_about, sample_half_vectors
+from shared.rendering.split_sum import frames_about, mirrored_about_axis
 
 LEAST_ROUGHNESS, ROUGH_LEVEL = 0.08, 0.5
 FLOOR = 0.05
@@ -131,9 +131,8 @@ def _torch_csr(matrix: sparse.csr_matrix, dtype) -> torch.Tensor:
 
 def lobe_filter(resolution: int, roughness: float) -> sparse.csr_matrix:
     """[6 n^2, 6 n^2] rows of sum 1: light seen through the lobe of a roughness along its axis, n = o = r."""
-    half = sample_half_vectors(roughness)
-    local = 2.0 * half[:, 2:] * half - np.array([0.0, 0.0, 1.0])
-    return _kernel_filter(resolution, resolution, local[local[:, 2] > 0], local[local[:, 2] > 0, 2])
+    local, cosine = mirrored_about_axis(roughness)
+    return _kernel_filter(resolution, resolution, local, cosine)
 
 
 def cosine_filter(resolution: int, source: int) -> sparse.csr_matrix:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from shared.geometry.mesh import Mesh, face_normals
+from shared.geometry.mesh import Mesh, face_normals, half_edges
 from shared.geometry.raycast import RayScene, camera_hits, pixel_directions
 from shared.geometry.transforms import camera_centres
 
@@ -87,7 +87,7 @@ class Raster:
             torch.from_numpy(x.astype(np.int64)) for x in (mesh.faces, mesh.face_uvs)
         )
         self._uvs = torch.from_numpy(mesh.uvs).to(dtype)
-        edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+        edges = np.sort(half_edges(mesh.faces), axis=1)
         self._edges, of_corner, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
         order = np.argsort(of_corner.ravel(), kind="stable") % len(mesh.faces)
         first = np.concatenate([[0], np.cumsum(count)[:-1]])

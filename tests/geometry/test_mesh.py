@@ -33,6 +33,17 @@ def test_both_laplacians_know_the_number_of_neighbours():
     assert np.allclose(mean @ values, (whole @ values) / whole.diagonal())
 
 
+def test_the_rim_of_a_surface_in_its_faces_orientation():
+    plane = grid_plane(4)
+    rim = m.boundary_loop(plane.faces)
+    steps = set(zip(rim.tolist(), np.roll(rim, -1).tolist(), strict=True))
+    assert len(rim) == len(steps) == 4 * 3 and rim[0] == rim.min()
+    assert steps <= set(map(tuple, m.half_edges(plane.faces).tolist()))
+    two = np.concatenate([plane.faces, plane.faces + len(plane.vertices)])
+    with pytest.raises(ValueError, match="more than one boundary"):
+        m.boundary_loop(two)
+
+
 def test_midpoints_lie_in_the_middle_and_keep_the_area():
     plane = grid_plane(4)
     matrix, faces = m.midpoint_subdivision(plane.faces, len(plane.vertices))

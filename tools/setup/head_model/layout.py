@@ -11,10 +11,10 @@ eyeballs lie in a strip below.
 import numpy as np
 from scipy.sparse.linalg import splu
 
-from shared.geometry.mesh import graph_laplacian, vertex_adjacency
+from shared.geometry.mesh import boundary_loop, graph_laplacian, vertex_adjacency
 from tools.setup.head_model.relaxation import relax
 from tools.setup.head_model.segments import SEGMENT_NAMES
-from tools.setup.head_model.topology import EYE_LEFT, EYE_RIGHT, HeadTopology, boundary_loop
+from tools.setup.head_model.topology import EYE_LEFT, EYE_RIGHT, HeadTopology
 
 MARGIN = 4 / 1024
 STRIP = 0.078
