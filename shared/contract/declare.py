@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import PurePosixPath
 
-from shared.contract.fields import Field
 from shared.contract.wording import unknown_name
 from shared.errors import InputError, shown
 
@@ -112,6 +111,25 @@ class ParameterGroup:
     name: str
     case: str
     parameters: tuple[Parameter, ...]
+
+
+@dataclass(frozen=True)
+class Field:
+    """One entry of a JSON or NPZ file.
+
+    path: the keys that lead to it: `crop.scale`; `frames[].file` of every item of a list; `segments.<segment>.albedo`
+    where the key itself varies; `parameters.**` is `parameters` with everything below it. kind: number, int, text,
+    bool, number or null, or an array's NumPy type; '' for an entry that only holds others. shape: of arrays and lists,
+    numbers and letters separated by commas. unit: '' for counts, ratios and names. optional: may be absent, with all
+    below it.
+    """
+
+    path: str
+    help: str
+    kind: str = "number"
+    shape: str = ""
+    unit: str = ""
+    optional: bool = False
 
 
 @dataclass(frozen=True)

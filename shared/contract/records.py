@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from shared.contract.fields import Field
+from shared.contract.declare import Field
 
 FRAME_INDEX = Field("frame_index", "The frames, counted from 0 in the source.", "int64", "F")
 POSES = Field("camera_from_head", "The head's pose in each frame: a rigid motion.", "float64", "F, 4, 4", "mm")

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from field_check import field_faults, written_fields
 from toy_clip import FRAMES, MAP, toy_clip, true_maps
 
 from shared.compute.run_context import SILENT, RunContext
-from shared.contract.fields import field_faults, written_fields
 from shared.contract.job import Parameters
 from shared.contract.records import SOLVE
 from shared.imaging.image_sampling import SurfaceViewer

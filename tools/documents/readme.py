@@ -9,8 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 
-from shared.contract.declare import Output, Stage, parameter_table
-from shared.contract.fields import Field
+from shared.contract.declare import Field, Output, Stage, parameter_table
 from shared.contract.models import FACE_NETWORKS
 from shared.contract.pipeline import Pipeline, load_pipeline
 from shared.contract.records import MANIFEST, PROVENANCE
