@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from shared.contract import Job, Output, Parameter, Stage, main
+from shared.contract import Job, Output, Parameter, ParameterGroup, Stage, main
 from shared.contract.records import LADDER_TIMES, MESH, SOLVE, SOLVED_POSES
 from shared.errors import InputError, LimnError
 
@@ -32,6 +32,33 @@ SOLVERS = ("transfer", "reference")
 MODELS = ("full", "auto")
 SELECTION_SECONDS = "ladder_seconds.json"
 LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
+
+PUBLISHED = ParameterGroup(
+    "published",
+    "that count with solver=reference alone, the published solver",
+    (
+        Parameter("reference_iterations", int, 6000, "Iterations, one frame each.", "", 1, 1_000_000),
+        Parameter("reference_pixels", int, 0, "Pixels per iteration, drawn at random; 0: all.", "px", 0, 10**8),
+        Parameter("reference_light_samples", int, 256, "Samples of the diffuse integral by the light.", "", 1, 4096),
+        Parameter("reference_cosine_samples", int, 256, "Samples of the diffuse integral by the cosine.", "", 1, 4096),
+        Parameter("reference_lobe_samples", int, 64, "Samples of the highlights' visibility.", "", 1, 4096),
+        Parameter("reference_light_resolution", int, 256, "Edge of the light's cubemap faces; mips go down to 8.",
+                  "texels", choices=(8, 16, 32, 64, 128, 256, 512)),
+        Parameter("reference_vertices", bool, True, "Let the vertices move."),
+        Parameter("reference_vertex_rate", float, 0.1, "Adam's rate for vertices.", "mm", 0.0, 100.0),
+        Parameter("reference_light_rate", float, 0.1, "Adam's rate for the light.", "", 0.0, 100.0),
+        Parameter("reference_texture_rate", float, 0.001, "Adam's rate for textures.", "", 0.0, 1.0),
+        Parameter("reference_smoothing", float, 19.0, "Lambda of the large steps in shape.", "", 0.0, 1e6),
+        Parameter("reference_mask", float, 0.1, "Weight of the mask's loss.", "", 0.0, 1e6),
+        Parameter("reference_laplacian", float, 10.0, "Weight of the vertices' Laplacian.", "", 0.0, 1e6),
+        Parameter("reference_white_light", float, 0.1, "Weight of the light's deviation from grey.", "", 0.0, 1e6),
+        Parameter("reference_roughness_variation", float, 0.1, "Weight of the roughness's variation.", "", 0.0, 1e6),
+        Parameter("reference_diffuse", float, 0.01, "Weight of the squared diffuse albedo.", "", 0.0, 1e6),
+        Parameter("reference_checkpoint_every", int, 100, "Iterations between checkpoints, from which a run that "
+                  "was cut off goes on.", "", 1, 1_000_000),
+        Parameter("reference_seed", int, 0, "Seed of its random choices.", "", 0, 2**31 - 1, former="seed"),
+    ),
+)
 
 STAGE = Stage(
     name="inverse_render",
@@ -110,29 +137,10 @@ STAGE = Stage(
         Parameter("fit_frames", int, 0, "Fit this many frames only, chosen to cover the face; 0: all but those held "
                   "out.", "frames", 0, 1000),
         Parameter("solver", str, "transfer", "How: precomputed transfer in closed form, or the published stochastic "
-                  "descent, a yardstick with the reference_ parameters; it counts no bounces.", choices=SOLVERS),
-        Parameter("reference_iterations", int, 6000, "Iterations, one frame each.", "", 1, 1_000_000),
-        Parameter("reference_pixels", int, 0, "Pixels per iteration, drawn at random; 0: all.", "px", 0, 10**8),
-        Parameter("reference_light_samples", int, 256, "Samples of the diffuse integral by the light.", "", 1, 4096),
-        Parameter("reference_cosine_samples", int, 256, "Samples of the diffuse integral by the cosine.", "", 1, 4096),
-        Parameter("reference_lobe_samples", int, 64, "Samples of the highlights' visibility.", "", 1, 4096),
-        Parameter("reference_light_resolution", int, 256, "Edge of the light's cubemap faces; mips go down to 8.",
-                  "texels", choices=(8, 16, 32, 64, 128, 256, 512)),
-        Parameter("reference_vertices", bool, True, "Let the vertices move."),
-        Parameter("reference_vertex_rate", float, 0.1, "Adam's rate for vertices.", "mm", 0.0, 100.0),
-        Parameter("reference_light_rate", float, 0.1, "Adam's rate for the light.", "", 0.0, 100.0),
-        Parameter("reference_texture_rate", float, 0.001, "Adam's rate for textures.", "", 0.0, 1.0),
-        Parameter("reference_smoothing", float, 19.0, "Lambda of the large steps in shape.", "", 0.0, 1e6),
-        Parameter("reference_mask", float, 0.1, "Weight of the mask's loss.", "", 0.0, 1e6),
-        Parameter("reference_laplacian", float, 10.0, "Weight of the vertices' Laplacian.", "", 0.0, 1e6),
-        Parameter("reference_white_light", float, 0.1, "Weight of the light's deviation from grey.", "", 0.0, 1e6),
-        Parameter("reference_roughness_variation", float, 0.1, "Weight of the roughness's variation.", "", 0.0, 1e6),
-        Parameter("reference_diffuse", float, 0.01, "Weight of the squared diffuse albedo.", "", 0.0, 1e6),
-        Parameter("reference_device", str, "cpu", "Where torch computes; rays are traced on the CPU.",
-                  choices=("cpu", "cuda")),
-        Parameter("reference_checkpoint_every", int, 100, "Iterations between checkpoints, from which a run that "
-                  "was cut off goes on.", "", 1, 1_000_000),
+                  "descent, a yardstick with parameters of its own; it counts no bounces.", choices=SOLVERS),
     ),
+    groups=(PUBLISHED,),
+    retired=(("reference_device", "leave it out: the published solver computes on the processor"),),
 )
 
 CHECKPOINT = "inverse_render.checkpoint.npz"

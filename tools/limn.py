@@ -102,6 +102,7 @@ def make_parser() -> argparse.ArgumentParser:
     check.set_defaults(command=check_command)
     table = commands.add_parser("parameters", help="every stage's parameters as a table")
     table.add_argument("stages", nargs="*", metavar="STAGE")
+    table.add_argument("--group", metavar="NAME", help="those of a group, which count in one case only")
     table.add_argument("--pipeline", type=Path, metavar="FILE")
     table.set_defaults(command=parameters_command)
     return parser
@@ -271,7 +272,15 @@ def parameters_command(args: argparse.Namespace) -> int:
     for name in args.stages:
         if name not in stages:
             raise unknown_name("stage", name, stages, "parameters")
-    print(parameter_table([stage for name, stage in stages.items() if not args.stages or name in args.stages]), end="")
+    chosen = [stage for name, stage in stages.items() if not args.stages or name in args.stages]
+    groups = {group.name: group for stage in chosen for group in stage.groups}
+    if args.group is not None and args.group not in groups:
+        raise unknown_name("group of parameters", args.group, groups, "parameters --group")
+    table = {stage.name: [p for group in stage.groups if group.name == args.group for p in group.parameters]
+             for stage in chosen} if args.group else {stage.name: stage.common for stage in chosen}
+    print(parameter_table(table), end="")
+    for group in () if args.group else groups.values():
+        print(f"\nThose {group.case}: limn parameters --group {group.name}")
     return 0
 
 

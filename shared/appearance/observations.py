@@ -9,7 +9,7 @@ import numpy as np
 from shared.appearance.chart_scale import ChartStatement
 from shared.compute.read_ahead import read_ahead
 from shared.compute.run_context import RunContext
-from shared.geometry.transforms import world_from_head
+from shared.geometry.transforms import camera_centres, world_from_head
 from shared.imaging.frame_index import frames_of_lights, spread_frames
 from shared.imaging.image_sampling import Samples, SurfaceViewer, sample_points_in_frames
 from shared.imaging.views import Views
@@ -50,8 +50,7 @@ class Capture:
 
 def face_front(viewer: SurfaceViewer, camera_from_head: np.ndarray, limit: float) -> np.ndarray:
     """[V] bool: vertices that turn towards the camera in some frame, by more than the cosine limit."""
-    rotation, translation = camera_from_head[:, :3, :3], camera_from_head[:, :3, 3]
-    centres = -np.einsum("fji,fj->fi", rotation, translation)
+    centres = camera_centres(camera_from_head)
     found = np.zeros(len(viewer.mesh.vertices), bool)
     for centre in centres[spread_frames(len(centres), 40)]:
         towards = centre - viewer.mesh.vertices

@@ -16,6 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from shared.compute.robust import cauchy_weight
 from shared.imaging.color import XYZ_FROM_REC709
 
 COLUMNS, ROWS = 6, 4
@@ -152,7 +153,7 @@ def _fit_channel(values: np.ndarray, reference: np.ndarray, spread: np.ndarray, 
         inverse = np.linalg.inv(design.T @ (weight[:, None] * design) + np.diag((prior * white) ** -2.0))
         solved = inverse @ (design.T @ (weight * values))
         error = (values - design @ solved) / (spread * white)
-        robust = 1.0 / (1.0 + (error / 2.5) ** 2)
+        robust = cauchy_weight(error, 2.5)
         white = max(float(solved[0]), 1e-6)
     freedom = max(used.sum() - len(prior), 1)
     variance_inflation = max(1.0, float((used * robust * error**2).sum()) / freedom)

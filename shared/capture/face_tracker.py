@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from shared.capture.framing import landmark_box
-from shared.capture.landmarks import Detection, FaceNetworks
+from shared.capture.landmarks import Detection, FaceNetworks, box_overlap
 
 MIN_PRESENCE = 0.5
 # A face just lost is looked for in every frame; with the costly search in small windows only where no face is in sight,
@@ -82,7 +82,7 @@ class FaceTracker:
 
     def _find(self, rgb: np.ndarray, zoom: bool) -> None:
         for detection in self._networks.detect(rgb, zoom=zoom)[:MAX_FACES]:
-            followed = any(track.last is not None and _overlap(landmark_box(track.last), detection.box)
+            followed = any(track.last is not None and box_overlap(landmark_box(track.last), detection.box)
                            > SAME_FACE_OVERLAP for track in self.tracks)
             if not followed:
                 presence, points = self._networks.landmarks(rgb, detection)
@@ -104,7 +104,7 @@ class FaceTracker:
         in_sight = sorted((t for t in self.tracks if t.last is not None), key=lambda t: -len(t.observations))
         for i, track in enumerate(in_sight):
             box = landmark_box(track.last)
-            if any(o.last is not None and _overlap(landmark_box(o.last), box) > 0.5 for o in in_sight[:i]):
+            if any(o.last is not None and box_overlap(landmark_box(o.last), box) > 0.5 for o in in_sight[:i]):
                 del track.observations[self._position]
                 track.last = None
         self.tracks = [track for track in self.tracks if track.observations]
@@ -116,10 +116,3 @@ def _centre(box: np.ndarray) -> np.ndarray:
 
 def _size(box: np.ndarray) -> float:
     return float(np.max(box[2:] - box[:2]))
-
-
-def _overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """Shared area of two boxes over the smaller one's."""
-    sides = np.maximum(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0)
-    smaller = min(np.prod(a[2:] - a[:2]), np.prod(b[2:] - b[:2]))
-    return float(np.prod(sides) / max(smaller, 1e-9))

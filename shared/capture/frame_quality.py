@@ -54,10 +54,10 @@ def background_drift(proxies: np.ndarray, background: np.ndarray) -> float:
     return float((high - low) / max(middle, 1e-4))
 
 
-def local_median(values: np.ndarray, reach: int = NEIGHBOURS) -> np.ndarray:
-    """[N] -> [N]: median over each value and its `reach` neighbours on both sides; NaN counts as absent."""
-    padded = np.pad(np.asarray(values, float), reach, constant_values=np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
+def local_median(values: np.ndarray) -> np.ndarray:
+    """[N] -> [N]: median over each value and its NEIGHBOURS on both sides; NaN counts as absent."""
+    padded = np.pad(np.asarray(values, float), NEIGHBOURS, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1)
     known = np.isfinite(windows).any(axis=1)
     medians = np.full(len(windows), np.nan)
     medians[known] = np.nanmedian(windows[known], axis=1)

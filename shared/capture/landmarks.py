@@ -236,8 +236,8 @@ def _suppress(detections: list[Detection], max_overlap: float = 0.3) -> list[Det
     kept = []
     while rest:
         best = rest.pop(0)
-        group = [best] + [d for d in rest if _overlap(best.box, d.box) > max_overlap]
-        rest = [d for d in rest if _overlap(best.box, d.box) <= max_overlap]
+        group = [best] + [d for d in rest if box_overlap(best.box, d.box) > max_overlap]
+        rest = [d for d in rest if box_overlap(best.box, d.box) <= max_overlap]
         weights = np.array([d.score for d in group])
         kept.append(
             Detection(
@@ -249,8 +249,8 @@ def _suppress(detections: list[Detection], max_overlap: float = 0.3) -> list[Det
     return kept
 
 
-def _overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """Shared area of two boxes over the smaller one's: a nested box counts as the same face."""
+def box_overlap(a: np.ndarray, b: np.ndarray) -> float:
+    """Shared area of two boxes [4] (x0, y0, x1, y1) over the smaller one's: a nested box counts as the same face."""
     sides = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
     smaller = min(np.prod(a[2:] - a[:2]), np.prod(b[2:] - b[:2]))
     return float(np.prod(np.maximum(sides, 0)) / max(smaller, 1e-9))

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from shared.contract.currency import reasons_to_run, work_to_do
-from shared.contract.declare import Stage
+from shared.contract.declare import Parameter, Stage
 from shared.contract.disk import disk_fault
 from shared.contract.drift import drift
 from shared.contract.execute import execute
@@ -98,9 +98,8 @@ class OneLineParser(argparse.ArgumentParser):
 
 def make_parser(stage: Stage) -> argparse.ArgumentParser:
     """The stage's command line, with its parameters in the help text."""
-    lines = [f"  {p.name:24} {p.help} Default {p.default}; {p.expected}." for p in stage.parameters]
     parser = OneLineParser(prog=f"python -m stages.{stage.name}", description=stage.help,
-                            epilog="parameters:\n" + "\n".join(lines), formatter_class=argparse.RawTextHelpFormatter)
+                           epilog=_parameter_lines("", stage.common), formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--subject", type=Path, required=True, metavar="DIR", help="folder with subject.yaml")
     parser.add_argument("--clip", metavar="NAME", help="which clip, where subject.yaml names several")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write to DIR/<subject>/, not to the subject's folder")
@@ -112,7 +111,15 @@ def make_parser(stage: Stage) -> argparse.ArgumentParser:
     parser.add_argument("--renew", action="store_true", help="run, too, if other code or packages made the result")
     parser.add_argument("--verify", action="store_true", help="read every file again to see whether it is current")
     parser.add_argument("--events", type=Path, help=argparse.SUPPRESS)
+    for group in stage.groups:
+        parser.add_argument(f"--help-{group.name}", action="version", help=f"list the parameters {group.case}",
+                            version=_parameter_lines(f" {group.case}", group.parameters))
     return parser
+
+
+def _parameter_lines(case: str, parameters: Sequence[Parameter]) -> str:
+    lines = [f"  {p.name:24} {p.help} Default {p.default}; {p.expected}." for p in parameters]
+    return "\n".join([f"parameters{case}:", *lines])
 
 
 def parse_request(stage: Stage, argv: Sequence[str] | None) -> Request:

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import PurePosixPath
 
-from shared.contract.fields import Field
 from shared.contract.wording import unknown_name
 from shared.errors import InputError, shown
 
@@ -103,6 +102,37 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class ParameterGroup:
+    """Parameters that count in one case only. What lists parameters leaves them out until asked for the group.
+
+    case: which case, as a clause that ends 'parameters ...'.
+    """
+
+    name: str
+    case: str
+    parameters: tuple[Parameter, ...]
+
+
+@dataclass(frozen=True)
+class Field:
+    """One entry of a JSON or NPZ file.
+
+    path: the keys that lead to it: `crop.scale`; `frames[].file` of every item of a list; `segments.<segment>.albedo`
+    where the key itself varies; `parameters.**` is `parameters` with everything below it. kind: number, int, text,
+    bool, number or null, or an array's NumPy type; '' for an entry that only holds others. shape: of arrays and lists,
+    numbers and letters separated by commas. unit: '' for counts, ratios and names. optional: may be absent, with all
+    below it.
+    """
+
+    path: str
+    help: str
+    kind: str = "number"
+    shape: str = ""
+    unit: str = ""
+    optional: bool = False
+
+
+@dataclass(frozen=True)
 class Output:
     """A file of a stage's folder, or many by a pattern (`frames/*.png` or `frames/%06d.png`).
 
@@ -134,17 +164,20 @@ def folder_of(name: str) -> str:
     return EXPORT if name.startswith("export_") else f"work/{name}"
 
 
-SEED = Parameter("seed", int, 0, "Seed of every random choice in the stage.", "", 0, 2**31 - 1)
+_RETIRED = {"seed": "leave it out: nothing in the stage is random"}
+"""What every stage once had, and what to do now."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Declaration of one stage. `seed` is added to the parameters of each.
+    """Declaration of one stage.
 
     inputs: stages whose folders are read. A stage without inputs reads the subject's video. given: files of the subject
     that are read where subject.yaml names them. models: files of the models folder that are read, see models.py. A
     stage named export_* publishes to `export/`, all others to `work/<name>/`. joins: inputs of which the stage reads
     every clip's, where a subject has several clips; a stage that joins nothing then runs for each clip by itself.
+    groups: parameters that count in one case only; they join the others. retired: (name, what to do instead) of
+    parameters that are no more, with which they are refused.
     """
 
     name: str
@@ -156,15 +189,16 @@ class Stage:
     given: tuple[str, ...] = ()
     joins: tuple[str, ...] = ()
     models: tuple[str, ...] = ()
+    groups: tuple[ParameterGroup, ...] = ()
+    retired: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "inputs", tuple(self.inputs))
         object.__setattr__(self, "outputs", tuple(self.outputs))
-        parameters = tuple(self.parameters)
-        if all(p.name != SEED.name for p in parameters):
-            parameters += (SEED,)
-        object.__setattr__(self, "parameters", parameters)
-        names = [p.name for p in parameters] + [p.former for p in parameters if p.former]
+        grouped = tuple(p for group in self.groups for p in group.parameters)
+        object.__setattr__(self, "parameters", (*self.parameters, *grouped))
+        names = [p.name for p in self.parameters] + [p.former for p in self.parameters if p.former]
+        names += [name for name, _ in self.retired]
         if not set(self.joins) <= set(self.inputs):
             raise ValueError(f"stage {self.name!r} joins what is not among its inputs")
         if not _NAME.match(self.name) or not self.help or not self.outputs or len(set(names)) != len(names):
@@ -179,6 +213,11 @@ class Stage:
     def folder(self) -> str:
         """Where the stage publishes, relative to the run's folder."""
         return folder_of(self.name)
+
+    @property
+    def common(self) -> tuple[Parameter, ...]:
+        """The parameters that count in any case: those of no group."""
+        return self.parameters[: len(self.parameters) - sum(len(group.parameters) for group in self.groups)]
 
     def defaults(self) -> dict[str, object]:
         """{parameter: default}."""
@@ -195,6 +234,8 @@ class Stage:
             if name in renamed:
                 raise InputError(f"parameter {self.name}.{name} has another name now", where=where,
                                  hint=f"write {self.name}.{renamed[name]}")
+            if name not in known and (instead := {**_RETIRED, **dict(self.retired)}.get(name)):
+                raise InputError(f"parameter {self.name}.{name} is no more", where=where, hint=instead)
             if name not in known:
                 raise unknown_name("parameter", f"{self.name}.{name}", [f"{self.name}.{key}" for key in known], where)
         return {name: known[name].parse(value, f"{where}: {self.name}.{name}") for name, value in values.items()}
@@ -204,12 +245,12 @@ class Stage:
         return next((output for output in self.outputs if output.matches(relative)), None)
 
 
-def parameter_table(stages: Sequence[Stage]) -> str:
-    """Markdown table of all parameters, for `limn parameters` and docs/parameters.md."""
+def parameter_table(parameters: Mapping[str, Sequence[Parameter]]) -> str:
+    """Markdown table of {stage: parameters}, for `limn parameters` and docs/parameters.md."""
     rows = ["| stage | parameter | default | range | unit | what |", "|---|---|---|---|---|---|"]
-    for stage in stages:
-        for p in stage.parameters:
+    for stage, own in parameters.items():
+        for p in own:
             allowed = ", ".join(f"`{c}`" for c in p.choices) or p.range
             default = "none" if p.default is None else str(p.default).lower() if p.type is bool else p.default
-            rows.append(f"| {stage.name} | `{p.name}` | `{default}` | {allowed} | {p.unit} | {p.help} |")
+            rows.append(f"| {stage} | `{p.name}` | `{default}` | {allowed} | {p.unit} | {p.help} |")
     return "\n".join(rows) + "\n"

@@ -71,7 +71,7 @@ def _do(request: Request, work: Work, run: Callable[[Job], None], check: Callabl
     """Runs, checks, publishes; returns the wall seconds."""
     stage, folders = request.stage, request.run
     inputs = folders.inputs(stage, [clip.name for clip in request.subject.clips])
-    job = Job(stage, request.subject, request.parameters, temporary, folders, inputs, reporter, request.threads)
+    job = Job(stage, request.subject, request.parameters, temporary, inputs, reporter, request.threads)
     meter = Meter()
     try:
         run(job)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TypeVar
 
 from shared.contract.declare import Stage
-from shared.contract.folders import RunFolder
 from shared.contract.manifest import PROVENANCE, read_manifest, read_record
 from shared.contract.progress import Reporter
 from shared.contract.subject import Subject
@@ -29,7 +28,7 @@ class Parameters:
         return f"Parameters({self.__dict__})"
 
     def as_dict(self) -> dict[str, object]:
-        """{name: value}, the seed included."""
+        """{name: value}."""
         return dict(self.__dict__)
 
 
@@ -37,16 +36,16 @@ class Job:
     """One run of one stage.
 
     subject: facts of subject.yaml; of several clips, of the one that this run is about, or of all. params: the stage's
-    parameters, `seed` included. out: the folder to write into; it is published when run and check have returned.
-    threads: cores the stage may use.
+    parameters. out: the folder to write into; it is published when run and check have returned. threads: cores the
+    stage may use.
     """
 
-    def __init__(self, stage: Stage, subject: Subject, params: Mapping[str, object], out: Path, run: RunFolder,
+    def __init__(self, stage: Stage, subject: Subject, params: Mapping[str, object], out: Path,
                  folders: Mapping[str, Path], reporter: Reporter, threads: int) -> None:
         """folders: {stage: published folder} of the declared inputs, or {clip/stage: ...}."""
         self.stage, self.subject, self.params, self.out = stage, subject, Parameters(params), out
         self.threads = threads
-        self._run, self._folders, self._reporter = run, dict(folders), reporter
+        self._folders, self._reporter = dict(folders), reporter
 
     @property
     def clips(self) -> tuple[str, ...]:

@@ -25,20 +25,18 @@ SUBJECT_INPUT, VIDEO_INPUT, CHART_INPUT = "subject.yaml", "video", "chart"
 class Work:
     """One stage's work, fully determined: the same Work gives the same bytes.
 
-    parameters: without the seed. inputs: {name: SHA-256}; of stages the digest of their outputs; None where a stage has
-    yet to run.
+    inputs: {name: SHA-256}; of stages the digest of their outputs; None where a stage has yet to run.
     """
 
     stage: str
     version: int
     parameters: Mapping[str, object]
-    seed: int
     inputs: Mapping[str, str | None]
 
     def content(self) -> dict[str, object]:
         """The manifest's part that is known before the work is done."""
         return {"schema": SCHEMA, "stage": self.stage, "version": self.version, "parameters": dict(self.parameters),
-                "seed": self.seed, "inputs": dict(self.inputs)}
+                "inputs": dict(self.inputs)}
 
     @property
     def key(self) -> str:
@@ -57,8 +55,7 @@ class Work:
         reasons = []
         if manifest["version"] != self.version:
             reasons.append(f"stage version {manifest['version']} -> {self.version}")
-        before = {**manifest["parameters"], "seed": manifest["seed"]}
-        now = {**self.parameters, "seed": self.seed}
+        before, now = manifest["parameters"], self.parameters
         reasons += [f"parameter {name}: {_before(before, name)} -> {_before(now, name)}"
                     for name in sorted({*before, *now}) if _before(before, name) != _before(now, name)]
         read = manifest["inputs"]
@@ -73,8 +70,7 @@ def _before(values: Mapping[str, object], name: str) -> str:
 
 def make_work(stage: Stage, parameters: Mapping[str, object], inputs: Mapping[str, str | None]) -> Work:
     """The work that a stage is to do."""
-    rest = {name: value for name, value in parameters.items() if name != "seed"}
-    return Work(stage.name, stage.version, rest, int(parameters["seed"]), inputs)
+    return Work(stage.name, stage.version, dict(parameters), inputs)
 
 
 def source_inputs(stage: Stage, subject: Subject, memory: HashMemory) -> dict[str, str]:
@@ -163,8 +159,7 @@ def read_manifest(folder: Path) -> dict | None:
 
 def _is_manifest(record: Mapping[str, object]) -> bool:
     """Whether the record has all that a manifest needs, each of its kind, and names files of its own folder only."""
-    kinds = {"schema": int, "stage": str, "version": int, "parameters": dict, "seed": int, "inputs": dict,
-             "outputs": dict}
+    kinds = {"schema": int, "stage": str, "version": int, "parameters": dict, "inputs": dict, "outputs": dict}
     if not all(isinstance(record.get(name), kind) for name, kind in kinds.items()):
         return False
     for name, entry in record["outputs"].items():

@@ -238,7 +238,7 @@ def _preset(value: object, steps: Mapping[str, Step], where: str) -> dict[str, M
     return {name: check_keys(settings, Anything(), f"{where}.{name}") for name, settings in given.items()}
 
 
-def split_settings(settings: Iterable[str], stages: Iterable[str], where: str = "--set") -> dict[str, dict[str, str]]:
+def split_settings(settings: Iterable[str], stages: Iterable[str]) -> dict[str, dict[str, str]]:
     """['stage.key=value', ...] -> {stage: {key: value}}; InputError for what is not of that form."""
     stages = tuple(stages)
     values: dict[str, dict[str, str]] = {}
@@ -246,9 +246,9 @@ def split_settings(settings: Iterable[str], stages: Iterable[str], where: str = 
         name, equals, value = setting.partition("=")
         stage, dot, key = name.strip().partition(".")
         if not equals or not dot or not key:
-            raise InputError("setting not understood", where=where, got=setting, expected="stage.key=value",
+            raise InputError("setting not understood", where="--set", got=setting, expected="stage.key=value",
                              hint="" if dot else f"stages: {', '.join(stages)}")
         if stage not in stages:
-            raise InputError(f"unknown stage {stage!r}", where=where, hint=nearest(stage, stages))
+            raise InputError(f"unknown stage {stage!r}", where="--set", hint=nearest(stage, stages))
         values.setdefault(stage, {})[key] = value.strip()
     return values

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from shared.contract.fields import Field
+from shared.contract.declare import Field
 
 FRAME_INDEX = Field("frame_index", "The frames, counted from 0 in the source.", "int64", "F")
 POSES = Field("camera_from_head", "The head's pose in each frame: a rigid motion.", "float64", "F, 4, 4", "mm")
@@ -288,7 +288,6 @@ MANIFEST = (
     Field("stage", "The stage's name.", "text"),
     Field("version", "Its version.", "int"),
     Field("parameters.**", "Its parameters as used.", ""),
-    Field("seed", "The seed of its random choices.", "int"),
     Field("inputs", "SHA-256 of all that it read, by name.", ""),
     Field("inputs.<name>", "Of a stage, over all of its files.", "text"),
     Field("key", "SHA-256 of all of the above: equal keys, equal results.", "text"),

@@ -16,6 +16,8 @@ _ENDS = 1e-3
 """Share of an edge at both ends that is not followed: there the faces around it begin."""
 _MOST_HALVINGS = 4
 _LEAST_AREA = 0.02
+_RINGS = 2
+"""Of vertices around a crossing that move less, at first."""
 
 
 def crossing_edges(vertices: np.ndarray, faces: np.ndarray, edges: np.ndarray | None = None) -> np.ndarray:
@@ -45,7 +47,7 @@ def turned_faces(start: np.ndarray, moved: np.ndarray, faces: np.ndarray) -> np.
     return (before * after).sum(1) < _LEAST_AREA * (before * before).sum(1)
 
 
-def move_without_crossing(start: np.ndarray, wanted: np.ndarray, faces: np.ndarray, rings: int = 2) -> np.ndarray:
+def move_without_crossing(start: np.ndarray, wanted: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Vertices [V, 3] as near to wanted as goes without crossings that start did not have and without turned faces.
 
     Where moved faces cross, turn over or lose nearly all area, the move of the vertices around is halved, at last
@@ -65,7 +67,7 @@ def move_without_crossing(start: np.ndarray, wanted: np.ndarray, faces: np.ndarr
         around = np.zeros(len(start))
         around[crossing.ravel()] = 1.0
         around[faces[turned].ravel()] = 1.0
-        for _ in range(rings + attempt):
+        for _ in range(_RINGS + attempt):
             around = np.maximum(around, (adjacency @ around > 0) * 1.0)
         share = np.where(around > 0, 0.5 * share if attempt < _MOST_HALVINGS - 1 else 0.0, share)
     return start + share[:, None] * (wanted - start)

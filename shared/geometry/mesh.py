@@ -62,11 +62,41 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return normalised(total)
 
 
+def half_edges(faces: np.ndarray) -> np.ndarray:
+    """[F, 3] -> [3 F, 2]: each face's edges in its orientation; corners 0 and 1 of all faces, then 1 and 2, 2 and 0."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def boundary_loop(faces: np.ndarray) -> np.ndarray:
+    """[F, 3] -> [N]: vertices along the rim of a surface of one boundary, in its faces' orientation, the lowest first.
+
+    ValueError where the surface has more than one boundary.
+    """
+    pairs = half_edges(faces)
+    _, edge, shared = unique_pairs(np.sort(pairs, axis=1))
+    following = dict(pairs[shared[edge] == 1].tolist())
+    loop = [min(following)]
+    while following[loop[-1]] != loop[0]:
+        loop.append(following[loop[-1]])
+    if len(loop) != len(following):
+        raise ValueError(f"the surface has more than one boundary: {len(loop)} of {len(following)} edges in a loop")
+    return np.array(loop)
+
+
 def vertex_adjacency(faces: np.ndarray, count: int) -> sparse.csr_matrix:
     """[F, 3] -> [count, count]: 1 where an edge joins two vertices."""
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    pairs = half_edges(faces)
     adjacency = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
     return ((adjacency + adjacency.T) > 0).astype(np.float64)
+
+
+def graph_laplacian(faces: np.ndarray, count: int) -> sparse.csr_matrix:
+    """[F, 3] -> [count, count]: D - A, so that L @ x is each vertex, as often as it has neighbours, minus their sum.
+
+    Symmetric. A: vertex_adjacency; D: diagonal, the number of neighbours.
+    """
+    adjacency = vertex_adjacency(faces, count)
+    return (sparse.diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency).tocsr()
 
 
 def uniform_laplacian(faces: np.ndarray, count: int) -> sparse.csr_matrix:

@@ -10,6 +10,11 @@ import numpy as np
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 
+from shared.geometry.transforms import camera_centres
+
+RAY_START_MM = 0.05
+"""How far above a surface rays start that must not meet it again."""
+
 
 class RayScene:
     """An acceleration structure over vertices [V, 3] and faces [F, 3]."""
@@ -87,8 +92,7 @@ def camera_hits(
     offsets: tuple[float, float] = (0.5, 0.5),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What each pixel sees: face [H, W] (-1: background), bary [H, W, 3], depth [H, W] mm along the camera's z axis."""
-    rotation, translation = camera_from_head[:3, :3], camera_from_head[:3, 3]
-    directions = pixel_directions(intrinsics, width, height, offsets).reshape(-1, 3) @ rotation
-    origins = np.broadcast_to(-translation @ rotation, directions.shape)
+    directions = pixel_directions(intrinsics, width, height, offsets).reshape(-1, 3) @ camera_from_head[:3, :3]
+    origins = np.broadcast_to(camera_centres(camera_from_head), directions.shape)
     face, bary, depth = scene.intersect(origins, directions)
     return face.reshape(height, width), bary.reshape(height, width, 3), depth.reshape(height, width)

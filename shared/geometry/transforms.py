@@ -67,7 +67,7 @@ def projection_slope(points: np.ndarray, camera_from_head: np.ndarray, intrinsic
 
 
 def camera_centres(camera_from_head: np.ndarray) -> np.ndarray:
-    """[F, 4, 4] -> [F, 3]: where the camera stands in head space, mm."""
+    """[..., 4, 4] -> [..., 3]: where the camera stands in head space, mm."""
     return invert_rigid(camera_from_head)[..., :3, 3]
 
 

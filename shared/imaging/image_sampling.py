@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import scipy.sparse as sparse
 
-from shared.geometry.mesh import Mesh, face_normals, vertex_normals
-from shared.geometry.raycast import RayScene
+from shared.geometry.mesh import Mesh, face_normals, half_edges, vertex_normals
+from shared.geometry.raycast import RAY_START_MM, RayScene
 from shared.geometry.transforms import project
 
 CLIPPED_CODE = 0.98
@@ -24,6 +24,8 @@ CRUSHED_CODE = 0.012
 MINIMUM_VIEW_COSINE, MAXIMUM_LEAST_COSINE = 0.2, 0.5
 BALL_MM = 80.0
 """A head is as round as a ball of this radius where it curves away from the camera."""
+BORDER_PX = 3.0
+"""Within the mask a pixel counts the more the farther it is from the border, over this distance."""
 _REMAP_COLUMNS = 1024
 
 
@@ -78,17 +80,13 @@ class SurfaceViewer:
     draw all the others anew.
     """
 
-    def __init__(
-        self, mesh: Mesh, scene: RayScene, margin_mm: float = 2.0, offset: float = 0.05,
-        layout: np.ndarray | None = None,
-    ):
-        self.mesh, self.scene, self.offset = mesh, scene, offset
+    def __init__(self, mesh: Mesh, scene: RayScene, margin_mm: float = 2.0, layout: np.ndarray | None = None):
+        self.mesh, self.scene = mesh, scene
         self.layout = mesh.vertices if layout is None else layout
         self.error_mm, self.least_cosine = 0.0, MINIMUM_VIEW_COSINE
         self.normals = vertex_normals(mesh.vertices, mesh.faces)
         self._vertices, self._normals = mesh.vertices, self.normals
-        faces = mesh.faces
-        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        edges = half_edges(mesh.faces)
         length = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
         self.rings = max(1, round(margin_mm / float(np.median(length))))
         shape = (len(mesh.vertices),) * 2
@@ -131,7 +129,7 @@ class SurfaceViewer:
         within = ((pixels > 1.0) & (pixels < np.array(size) - 1.0)).all(1) & (depth > 0)
         seen = within & (cosine > self.least_cosine)
         index = np.nonzero(seen)[0]
-        origins = vertices[index] + self.offset * normals[index]
+        origins = vertices[index] + RAY_START_MM * normals[index]
         hidden = index[self.scene.occluded(origins, towards[index])]
         weight = np.where(seen, cosine**2, 0.0)
         covered = np.zeros(len(vertices), bool)
@@ -147,12 +145,12 @@ class SurfaceViewer:
         return grown > 0
 
 
-def prepare_picture(codes: np.ndarray, linear: np.ndarray, mask: np.ndarray, border_px: float = 3.0) -> Picture:
+def prepare_picture(codes: np.ndarray, linear: np.ndarray, mask: np.ndarray) -> Picture:
     """codes [H, W, 3] uint8 or uint16, linear [H, W, 3] float32, mask [H, W] (0: background) -> Picture."""
     maximum = np.iinfo(codes.dtype).max
     saturation = (codes >= CLIPPED_CODE * maximum).astype(np.int8) - (codes <= CRUSHED_CODE * maximum).astype(np.int8)
     distance = cv2.distanceTransform((mask > 0).astype(np.uint8), cv2.DIST_L2, 3)
-    inside = np.clip((distance - 1.0) / border_px, 0.0, 1.0)
+    inside = np.clip((distance - 1.0) / BORDER_PX, 0.0, 1.0)
     levels = [np.ascontiguousarray(linear, np.float32)]
     while min(levels[-1].shape[:2]) >= 64:
         height, width = levels[-1].shape[:2]

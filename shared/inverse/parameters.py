@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
 from shared.appearance.light import LightPriors
 from shared.appearance.problem import AppearanceSettings
 from shared.appearance.skin_prior import SkinVariation
@@ -76,12 +74,9 @@ def read_forced(text: str) -> frozenset[str]:
 
 
 def read_reference(params: Parameters, checkpoint: Path | None = None) -> ReferenceSettings:
-    """The reference solver's settings; InputError where the device is absent."""
+    """The reference solver's settings."""
     prefix, given = "reference_", params.as_dict()
     own = {name.removeprefix(prefix): value for name, value in given.items() if name.startswith(prefix)}
-    if own["device"] == "cuda" and not torch.cuda.is_available():
-        raise InputError("no such device here", where="--set inverse_render.reference_device", got="cuda",
-                         hint="take cpu, or a machine and a build of torch with CUDA")
     samples = {name: own.pop(f"{name}_samples") for name in ("light", "cosine", "lobe")}
     weights = {name: own.pop(name) for name in ("mask", "laplacian", "white_light", "roughness_variation", "diffuse")}
     return ReferenceSettings(
@@ -90,7 +85,6 @@ def read_reference(params: Parameters, checkpoint: Path | None = None) -> Refere
         resolution=own.pop("light_resolution"),
         roughness=params.roughness,
         light_model=params.light_model,
-        seed=params.seed,
         checkpoint=checkpoint,
         **own,
     )

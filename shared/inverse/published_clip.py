@@ -121,7 +121,7 @@ class Checkpoint:
 
     def __init__(self, settings: ReferenceSettings, start: Start, views: Views):
         self.path, self.every = settings.checkpoint, settings.checkpoint_every
-        same = replace(settings, checkpoint=None, checkpoint_every=0, iterations=0, device="")
+        same = replace(settings, checkpoint=None, checkpoint_every=0, iterations=0)
         digest = hashlib.sha256(repr(same).encode())
         for array in (start.albedo, start.specular_intensity, start.radiance, views.camera_from_head, views.intrinsics):
             digest.update(np.ascontiguousarray(array).tobytes())

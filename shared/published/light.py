@@ -18,9 +18,11 @@ import torch
 
 from shared.rendering.brdf import MINIMUM_COSINE, microfacet_integrals
 from shared.rendering.envmap import cube_directions, cube_solid_angles, cube_texel, padded_cube_index
-from shared.rendering.split_sum import frames_about, sample_half_vectors
+from shared.rendering.split_sum import frames_about, mirrored_about_axis
 
 LEAST_ROUGHNESS, ROUGH_LEVEL = 0.08, 0.5
+FLOOR = 0.05
+"""Of the mean brightness, in every direction that light is sampled from: dark texels are looked at, too."""
 _IRRADIANCE_EDGE = 16
 _ROWS_AT_ONCE = 30_000
 # Of each face (+x -x +y -y +z -z): which component points right and down in it, and its sign (see
@@ -36,8 +38,8 @@ def face_coordinates(directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tens
     face = 2 * axis + negative
 
     def component(index: tuple, sign: tuple) -> torch.Tensor:
-        chosen = torch.tensor(index, device=directions.device)[face]
-        signs = torch.tensor(sign, device=directions.device, dtype=directions.dtype)[face]
+        chosen = torch.tensor(index)[face]
+        signs = torch.tensor(sign, dtype=directions.dtype)[face]
         return torch.gather(directions, 1, chosen[:, None])[:, 0] * signs / size
 
     return face, component(_RIGHT, _RIGHT_SIGN), component(_DOWN, _DOWN_SIGN)
@@ -46,9 +48,9 @@ def face_coordinates(directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tens
 class CubeSampler:
     """Bilinear look-ups in cubemaps of one resolution."""
 
-    def __init__(self, resolution: int, device: torch.device | str = "cpu"):
+    def __init__(self, resolution: int):
         self.resolution = resolution
-        self._padded = torch.from_numpy(padded_cube_index(resolution)).to(device)
+        self._padded = torch.from_numpy(padded_cube_index(resolution))
 
     def taps(self, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """[M, 3] unit directions -> texels [M, 4] and weights [M, 4]."""
@@ -113,25 +115,24 @@ class _Product(torch.autograd.Function):
 class SparseOperator:
     """A scipy matrix as a differentiable torch operator."""
 
-    def __init__(self, matrix: sparse.spmatrix, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32):
-        self._matrix, self._transposed = (_torch_csr(m.tocsr(), device, dtype) for m in (matrix, matrix.T))
+    def __init__(self, matrix: sparse.spmatrix, dtype: torch.dtype = torch.float32):
+        self._matrix, self._transposed = (_torch_csr(m.tocsr(), dtype) for m in (matrix, matrix.T))
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         return _Product.apply(x, self._matrix, self._transposed)
 
 
-def _torch_csr(matrix: sparse.csr_matrix, device, dtype) -> torch.Tensor:
+def _torch_csr(matrix: sparse.csr_matrix, dtype) -> torch.Tensor:
     rows, columns = (torch.from_numpy(part.astype(np.int64)) for part in (matrix.indptr, matrix.indices))
     values = torch.from_numpy(matrix.data).to(dtype)
     warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta", UserWarning)
-    return torch.sparse_csr_tensor(rows, columns, values, matrix.shape, check_invariants=False).to(device)
+    return torch.sparse_csr_tensor(rows, columns, values, matrix.shape, check_invariants=False)
 
 
 def lobe_filter(resolution: int, roughness: float) -> sparse.csr_matrix:
     """[6 n^2, 6 n^2] rows of sum 1: light seen through the lobe of a roughness along its axis, n = o = r."""
-    half = sample_half_vectors(roughness)
-    local = 2.0 * half[:, 2:] * half - np.array([0.0, 0.0, 1.0])
-    return _kernel_filter(resolution, resolution, local[local[:, 2] > 0], local[local[:, 2] > 0, 2])
+    local, cosine = mirrored_about_axis(roughness)
+    return _kernel_filter(resolution, resolution, local, cosine)
 
 
 def cosine_filter(resolution: int, source: int) -> sparse.csr_matrix:
@@ -157,18 +158,18 @@ def _kernel_filter(resolution: int, source: int, local: np.ndarray, weight: np.n
 class PrefilteredLight:
     """Mips of a cubemap, each filtered for its roughness."""
 
-    def __init__(self, resolution: int, smallest: int = 8, device: torch.device | str = "cpu", dtype=torch.float32):
+    def __init__(self, resolution: int, smallest: int = 8, dtype=torch.float32):
         count = max(1, int(np.log2(resolution / smallest)) + 1)
         self.edges = [resolution >> k for k in range(count)]
         steps = np.linspace(LEAST_ROUGHNESS, ROUGH_LEVEL, max(count - 1, 2))[: count - 1]
         self.roughness = [*map(float, steps), 1.0]
-        self._samplers = [CubeSampler(edge, device) for edge in self.edges]
+        self._samplers = [CubeSampler(edge) for edge in self.edges]
         self._filters = [
-            SparseOperator(lobe_filter(*level), device, dtype) for level in zip(self.edges, self.roughness, strict=True)
+            SparseOperator(lobe_filter(*level), dtype) for level in zip(self.edges, self.roughness, strict=True)
         ]
         self._cosine_edge = min(self.edges, key=lambda edge: abs(edge - _IRRADIANCE_EDGE))
-        self._cosine_sampler = CubeSampler(_IRRADIANCE_EDGE, device)
-        self._cosine = SparseOperator(cosine_filter(_IRRADIANCE_EDGE, self._cosine_edge), device, dtype)
+        self._cosine_sampler = CubeSampler(_IRRADIANCE_EDGE)
+        self._cosine = SparseOperator(cosine_filter(_IRRADIANCE_EDGE, self._cosine_edge), dtype)
 
     def mips(self, light: torch.Tensor) -> list[torch.Tensor]:
         """[6 n^2, 3] -> unfiltered levels, each the mean of two by two texels of the one before."""
@@ -203,11 +204,11 @@ class PrefilteredLight:
 class LightSampling:
     """Directions in proportion to the light's brightness, uniform within a texel, and the density of any direction."""
 
-    def __init__(self, light: torch.Tensor, floor: float = 0.05):
+    def __init__(self, light: torch.Tensor):
         self.resolution = round((len(light) / 6) ** 0.5)
         brightness = light.detach().mean(1).double()
-        brightness = brightness + floor * brightness.mean().clamp_min(1e-9)
-        solid = torch.from_numpy(cube_solid_angles(self.resolution)).to(light.device)
+        brightness = brightness + FLOOR * brightness.mean().clamp_min(1e-9)
+        solid = torch.from_numpy(cube_solid_angles(self.resolution))
         weight = brightness * solid
         self._share = weight / weight.sum()
         self._sums = torch.cumsum(self._share, 0)
@@ -219,12 +220,12 @@ class LightSampling:
         face, rest = texel // (n * n), texel % (n * n)
         right = 2.0 * ((rest % n) + random[:, 1]) / n - 1.0
         down = 2.0 * (torch.div(rest, n, rounding_mode="floor") + random[:, 2]) / n - 1.0
-        result = torch.empty((len(random), 3), dtype=dtype, device=random.device)
-        signs = torch.tensor([1.0, -1.0], dtype=dtype, device=random.device)
+        result = torch.empty((len(random), 3), dtype=dtype)
+        signs = torch.tensor([1.0, -1.0], dtype=dtype)
         result.scatter_(1, torch.div(face, 2, rounding_mode="floor")[:, None], signs[face % 2][:, None])
         for index, sign, value in ((_RIGHT, _RIGHT_SIGN, right), (_DOWN, _DOWN_SIGN, down)):
-            where = torch.tensor(index, device=random.device)[face]
-            signed = torch.tensor(sign, dtype=dtype, device=random.device)[face] * value.to(dtype)
+            where = torch.tensor(index)[face]
+            signed = torch.tensor(sign, dtype=dtype)[face] * value.to(dtype)
             result.scatter_(1, where[:, None], signed[:, None])
         return torch.nn.functional.normalize(result, dim=1)
 
@@ -238,16 +239,16 @@ class LightSampling:
 
 
 @lru_cache(maxsize=1)
-def energy_table(cosines: int = 64, roughnesses: int = 48) -> np.ndarray:
-    """[2, roughnesses, cosines]: the split sum's A and B on a grid of cell centres over n.o and roughness in 0 .. 1."""
-    cosine = (np.arange(cosines) + 0.5) / cosines
-    rough = np.maximum((np.arange(roughnesses) + 0.5) / roughnesses, 0.02)
+def energy_table() -> np.ndarray:
+    """[2, 48, 64]: the split sum's A and B on a grid of cell centres over roughness and n.o in 0 .. 1."""
+    cosine = (np.arange(64) + 0.5) / 64
+    rough = np.maximum((np.arange(48) + 0.5) / 48, 0.02)
     return np.stack([microfacet_integrals(cosine, r)[1:] for r in rough], axis=1)
 
 
 def split_sum_energy(cosine: torch.Tensor, roughness: torch.Tensor, f0: float) -> torch.Tensor:
     """F0 A + B [P], bilinear in the table, differentiable by both arguments [P]."""
-    table = torch.from_numpy(energy_table()).to(cosine.device, cosine.dtype)[None]
+    table = torch.from_numpy(energy_table()).to(cosine.dtype)[None]
     place = torch.stack([2.0 * cosine.clamp(MINIMUM_COSINE, 1.0) - 1.0, 2.0 * roughness - 1.0], dim=-1)[None, None]
     scale, bias = torch.nn.functional.grid_sample(table, place, padding_mode="border", align_corners=False)[0, :, 0]
     return f0 * scale + bias

@@ -17,8 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from shared.geometry.mesh import Mesh, face_normals
+from shared.geometry.mesh import Mesh, face_normals, half_edges
 from shared.geometry.raycast import RayScene, camera_hits, pixel_directions
+from shared.geometry.transforms import camera_centres
 
 NEAR_MM = 0.5
 """A pixel's surface lies behind an edge when it is deeper than it by this much."""
@@ -78,15 +79,15 @@ def torch_vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.T
 class Raster:
     """A mesh's topology before a camera of fixed lens. size: (width, height)."""
 
-    def __init__(self, mesh: Mesh, intrinsics: np.ndarray, size: tuple[int, int], device="cpu", dtype=torch.float32):
+    def __init__(self, mesh: Mesh, intrinsics: np.ndarray, size: tuple[int, int], dtype=torch.float32):
         self.faces, self.intrinsics, self.size = mesh.faces, intrinsics, size
         self._rays = pixel_directions(intrinsics, *size).reshape(-1, 3)
-        self._device, self._dtype = device, dtype
+        self._dtype = dtype
         self._faces, self._face_uvs = (
-            torch.from_numpy(x.astype(np.int64)).to(device) for x in (mesh.faces, mesh.face_uvs)
+            torch.from_numpy(x.astype(np.int64)) for x in (mesh.faces, mesh.face_uvs)
         )
-        self._uvs = torch.from_numpy(mesh.uvs).to(device, dtype)
-        edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+        self._uvs = torch.from_numpy(mesh.uvs).to(dtype)
+        edges = np.sort(half_edges(mesh.faces), axis=1)
         self._edges, of_corner, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
         order = np.argsort(of_corner.ravel(), kind="stable") % len(mesh.faces)
         first = np.concatenate([[0], np.cumsum(count)[:-1]])
@@ -109,10 +110,9 @@ class Raster:
         face: np.ndarray,
     ) -> SurfacePoints:
         """The surface behind flat pixel indices [P] that see these faces [P]; normals [V, 3] of the vertices."""
-        rotation, translation = camera_from_head[:3, :3], camera_from_head[:3, 3]
-        origin = self._tensor(-translation @ rotation)
-        direction = self._tensor(self._rays[pixels] @ rotation)
-        index = torch.from_numpy(face.astype(np.int64)).to(self._device)
+        origin = self._tensor(camera_centres(camera_from_head))
+        direction = self._tensor(self._rays[pixels] @ camera_from_head[:3, :3])
+        index = torch.from_numpy(face.astype(np.int64))
         a, b, c = vertices[self._faces[index]].unbind(1)
         # ray against triangle [Moeller1997]
         across = torch.linalg.cross(direction, c - a)
@@ -127,7 +127,7 @@ class Raster:
         return SurfacePoints(position, normal, uv, torch.nn.functional.normalize(origin - position, dim=1))
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array)).to(self._device, self._dtype)
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self._dtype)
 
     # ------------------------------------------------------------------ silhouettes
     def pairs(self, vertices: np.ndarray, camera_from_head: np.ndarray, hits: Hits) -> Pairs:
@@ -138,8 +138,8 @@ class Raster:
 
     def _project_silhouette(self, vertices: np.ndarray, camera_from_head: np.ndarray):
         """Pixels [E, 2, 2], depth [E, 2] and vertices [E, 2] of the edges between a front and a back face."""
-        centre = -camera_from_head[:3, 3] @ camera_from_head[:3, :3]
-        facing = ((centre - vertices[self.faces[:, 0]]) * face_normals(vertices, self.faces)).sum(1) > 0
+        towards = camera_centres(camera_from_head) - vertices[self.faces[:, 0]]
+        facing = (towards * face_normals(vertices, self.faces)).sum(1) > 0
         one, other = self._edge_faces.T
         edges = self._edges[(other >= 0) & (facing[one] != facing[other])]
         seen = vertices[edges] @ camera_from_head[:3, :3].T + camera_from_head[:3, 3]
@@ -186,11 +186,11 @@ class Raster:
     def crossing(self, vertices: torch.Tensor, camera_from_head: np.ndarray, pairs: Pairs) -> torch.Tensor:
         """[N] how far from the near pixel's centre towards the far one's the edge lies, 0 .. 1; differentiable."""
         rotation, shift = self._tensor(camera_from_head[:3, :3]), self._tensor(camera_from_head[:3, 3])
-        edge = torch.from_numpy(pairs.edge.astype(np.int64)).to(self._device)
+        edge = torch.from_numpy(pairs.edge.astype(np.int64))
         seen = vertices[edge] @ rotation.T + shift
         lens = self._tensor(self.intrinsics)
         pixels = seen[..., :2] / seen[..., 2:] * torch.stack([lens[0, 0], lens[1, 1]]) + lens[:2, 2]
-        axis = torch.from_numpy(pairs.axis).to(self._device)
+        axis = torch.from_numpy(pairs.axis)
         along = torch.where(axis[:, None] == 0, pixels[..., 0], pixels[..., 1])
         line = torch.where(axis[:, None] == 0, pixels[..., 1], pixels[..., 0])
         width = self.size[0]

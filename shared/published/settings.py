@@ -23,9 +23,8 @@ class Weights:
 class ReferenceSettings:
     """iterations, one frame each; pixels: of the frame, drawn anew each time, 0: all; resolution, smallest: edges of
     the light's first and last mip; rates: Adam's for vertices (mm), light and textures; smoothing: lambda of the large
-    steps; vertices: whether they move; device: torch's (rays are always traced on the CPU); light_model: see
-    light_models, cubemap: each texel's radiance by itself; checkpoint: file to go on from, written every
-    checkpoint_every iterations, or None."""
+    steps; vertices: whether they move; light_model: see light_models, cubemap: each texel's radiance by itself;
+    checkpoint: file to go on from, written every checkpoint_every iterations, or None."""
 
     iterations: int = 6000
     pixels: int = 0
@@ -40,7 +39,6 @@ class ReferenceSettings:
     vertices: bool = True
     roughness: float = 0.45
     light_model: str = "cubemap"
-    device: str = "cpu"
     seed: int = 0
     checkpoint: Path | None = None
     checkpoint_every: int = 100

@@ -17,12 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from shared.geometry.raycast import RayScene
+from shared.geometry.raycast import RAY_START_MM, RayScene
 from shared.published.light import CubeSampler, LightSampling, PrefilteredLight, split_sum_energy
 from shared.published.raster import SurfacePoints
 from shared.rendering.brdf import F0
 
-OFFSET_MM = 0.05
 _PIXELS_AT_ONCE = 4000
 
 
@@ -61,10 +60,10 @@ def tangent_frames(axis: torch.Tensor) -> torch.Tensor:
 class Shader:
     """Shades pixels of one light resolution. generator: of all random numbers, on the CPU."""
 
-    def __init__(self, resolution: int, sampling: Sampling, smallest: int = 8, device="cpu", dtype=torch.float32):
-        self.sampling, self.device, self.dtype = sampling, device, dtype
-        self.prefiltered = PrefilteredLight(resolution, smallest, device, dtype)
-        self._lookup = CubeSampler(resolution, device)
+    def __init__(self, resolution: int, sampling: Sampling, smallest: int = 8, dtype=torch.float32):
+        self.sampling, self.dtype = sampling, dtype
+        self.prefiltered = PrefilteredLight(resolution, smallest, dtype)
+        self._lookup = CubeSampler(resolution)
 
     def __call__(
         self,
@@ -80,7 +79,7 @@ class Shader:
 
         importance: the light [6 n^2, 3] whose brightness directs the samples; the light itself when None.
         """
-        turn = torch.from_numpy(np.ascontiguousarray(world_from_head)).to(self.device, self.dtype)
+        turn = torch.from_numpy(np.ascontiguousarray(world_from_head)).to(self.dtype)
         normal, towards = points.normal @ turn.T, points.towards @ turn.T
         levels = self.prefiltered.mips(light)
         if self.sampling.visibility:
@@ -105,11 +104,11 @@ class Shader:
         return radiance + lobe[:, None] * self.prefiltered.reflection(levels, reflected, texture.roughness)
 
     def _random(self, shape: tuple[int, ...], generator: torch.Generator) -> torch.Tensor:
-        return torch.rand(shape, generator=generator, dtype=self.dtype).to(self.device)
+        return torch.rand(shape, generator=generator, dtype=self.dtype)
 
     def _strata(self, pixels: int, count: int, generator: torch.Generator) -> torch.Tensor:
         """[pixels, count] one random number in each of count equal parts of 0 .. 1."""
-        steps = torch.arange(count, device=self.device, dtype=self.dtype)
+        steps = torch.arange(count, dtype=self.dtype)
         return ((steps + self._random((pixels, count), generator)) / count).clamp_max(1.0 - 1e-6)
 
     def _diffuse(self, light, sampler: LightSampling, normal, position, scene, turn, generator) -> torch.Tensor:
@@ -138,17 +137,17 @@ class Shader:
             kept = weight.reshape(-1) > 0
         factor = weight * torch.einsum("psj,pj->ps", directions, normal).clamp_min(0.0)
         radiance = self._lookup.fixed(light, directions.reshape(-1, 3)[kept])
-        pixel = torch.arange(pixels, device=self.device).repeat_interleave(total)[kept]
+        pixel = torch.arange(pixels).repeat_interleave(total)[kept]
         return normal.new_zeros((pixels, 3)).index_add(0, pixel, factor.reshape(-1)[kept][:, None] * radiance)
 
     def _open(self, position, normal, directions, wanted, scene: RayScene, turn) -> torch.Tensor:
         """[P, S] bool: directions [P, S, 3] of the light's space, where wanted, that meet nothing. Rays on the CPU."""
         pixel, sample = torch.nonzero(wanted, as_tuple=True)
-        offset = (position + OFFSET_MM * (normal @ turn)).detach()
+        offset = (position + RAY_START_MM * (normal @ turn)).detach()
         rays = (directions[pixel, sample] @ turn).detach()
         hidden = scene.occluded(offset[pixel].cpu().numpy(), rays.cpu().numpy())
-        result = torch.zeros(wanted.shape, dtype=torch.bool, device=self.device)
-        result[pixel, sample] = torch.from_numpy(~hidden).to(self.device)
+        result = torch.zeros(wanted.shape, dtype=torch.bool)
+        result[pixel, sample] = torch.from_numpy(~hidden)
         return result
 
     @torch.no_grad()

@@ -10,7 +10,7 @@ import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import splu
 
-from shared.geometry.mesh import uniform_laplacian, vertex_adjacency
+from shared.geometry.mesh import graph_laplacian, uniform_laplacian
 from shared.published.light import SparseOperator
 
 UNIT_MM = 100.0
@@ -19,12 +19,10 @@ UNIT_MM = 100.0
 
 
 class LargeSteps:
-    """x = (I + smoothing L)^-1 u with the combinatorial Laplacian L of a mesh of V vertices."""
+    """x = (I + smoothing L)^-1 u with the graph's Laplacian L of a mesh of V vertices."""
 
     def __init__(self, faces: np.ndarray, count: int, smoothing: float):
-        adjacency = vertex_adjacency(faces, count)
-        laplacian = sparse.diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency
-        self._matrix = (sparse.identity(count) + smoothing * laplacian).tocsc()
+        self._matrix = (sparse.identity(count) + smoothing * graph_laplacian(faces, count)).tocsc()
         self._solve = splu(self._matrix).solve
 
     def parameters(self, vertices: np.ndarray) -> np.ndarray:
@@ -50,15 +48,15 @@ class _Solved(torch.autograd.Function):
 
 
 def _on_cpu(solve, values: torch.Tensor) -> torch.Tensor:
-    solved = solve(values.detach().cpu().double().numpy())
-    return torch.from_numpy(solved).to(values.device, values.dtype)
+    solved = solve(values.detach().double().numpy())
+    return torch.from_numpy(solved).to(values.dtype)
 
 
 class LaplacianLoss:
     """Mean squared distance of vertices from the mean of their neighbours, in UNIT_MM."""
 
-    def __init__(self, faces: np.ndarray, count: int, device="cpu", dtype=torch.float32):
-        self._operator = SparseOperator(uniform_laplacian(faces, count), device, dtype)
+    def __init__(self, faces: np.ndarray, count: int):
+        self._operator = SparseOperator(uniform_laplacian(faces, count))
 
     def __call__(self, vertices: torch.Tensor) -> torch.Tensor:
         return (self._operator(vertices) / UNIT_MM).square().sum(1).mean()

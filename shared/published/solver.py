@@ -50,17 +50,16 @@ class ReferenceSolver:
     """Fits all views, which share one lens. Parameters are torch leaves by name: vertices (large-steps space), light,
     albedo, specular, roughness."""
 
-    def __init__(self, mesh: Mesh, views: Views, start: Start, settings: ReferenceSettings, dtype=torch.float32):
-        self.mesh, self.views, self.settings, self.dtype = mesh, views, settings, dtype
-        self.device = torch.device(settings.device)
+    def __init__(self, mesh: Mesh, views: Views, start: Start, settings: ReferenceSettings):
+        self.mesh, self.views, self.settings = mesh, views, settings
         few = settings.light_model != "cubemap"
         self.light_model = make_light_model(settings.light_model, MODEL_RESOLUTION) if few else None
         resolution = MODEL_RESOLUTION if few else settings.resolution
-        self.raster = Raster(mesh, views.intrinsics[0], views.size, self.device, dtype)
-        self.shader = Shader(resolution, settings.sampling, min(settings.smallest, resolution), self.device, dtype)
+        self.raster = Raster(mesh, views.intrinsics[0], views.size)
+        self.shader = Shader(resolution, settings.sampling, min(settings.smallest, resolution))
         self.steps = LargeSteps(mesh.faces, len(mesh.vertices), settings.smoothing)
-        self.laplacian = LaplacianLoss(mesh.faces, len(mesh.vertices), self.device, dtype)
-        self._faces = torch.from_numpy(mesh.faces.astype(np.int64)).to(self.device)
+        self.laplacian = LaplacianLoss(mesh.faces, len(mesh.vertices))
+        self._faces = torch.from_numpy(mesh.faces.astype(np.int64))
         self.parameters = self._start(start, resolution)
         self.optimiser = torch.optim.Adam(self._groups())
         self.iteration = 0
@@ -78,7 +77,7 @@ class ReferenceSolver:
             "specular": start.specular_intensity,
             "roughness": np.full(start.specular_intensity.shape, self.settings.roughness),
         }
-        tensors = {name: torch.tensor(array, dtype=self.dtype, device=self.device) for name, array in arrays.items()}
+        tensors = {name: torch.tensor(array, dtype=torch.float32) for name, array in arrays.items()}
         fixed = () if self.settings.vertices else ("vertices",)
         fixed += () if self.settings.sampling.specular else ("specular", "roughness")
         return {name: tensor.requires_grad_(name not in fixed) for name, tensor in tensors.items()}
@@ -129,7 +128,7 @@ class ReferenceSolver:
         points = self.raster.points(vertices, normals, camera_from_head, pixels[seen], face[seen])
         turn = world_from_head(camera_from_head[None], self.views.moves)[0]
         colours = self.shader(self.light(), points, self.texture(points.uv), scene, turn, generator)
-        rows = torch.from_numpy(seen).to(self.device)
+        rows = torch.from_numpy(seen)
         return colours.new_zeros((len(pixels), 3)).index_add(0, rows, colours)
 
     # ------------------------------------------------------------------ losses
@@ -190,11 +189,11 @@ class ReferenceSolver:
         near_by = np.nonzero(drawn[pairs.near] | drawn[pairs.far])[0]
         pixels = np.unique(np.concatenate([visible, pairs.near[near_by], pairs.far[near_by]]))
         near, far = [
-            torch.from_numpy(np.searchsorted(pixels, side[near_by])).to(self.device) for side in (pairs.near, pairs.far)
+            torch.from_numpy(np.searchsorted(pixels, side[near_by])) for side in (pairs.near, pairs.far)
         ]
         found = self.shade(pose, pixels, hits, geometry, generator)
-        found = blend(found, near, far, crossing[torch.from_numpy(near_by).to(self.device)])
-        found = found[torch.from_numpy(np.searchsorted(pixels, visible)).to(self.device)]
+        found = blend(found, near, far, crossing[torch.from_numpy(near_by)])
+        found = found[torch.from_numpy(np.searchsorted(pixels, visible))]
         image = (found - self._tensor(colours[visible])).abs().mean()
         return {"image": image, "mask": self._mask_loss(hits, pairs, crossing, person, near_border)}
 
@@ -202,12 +201,12 @@ class ReferenceSolver:
         """Mean absolute difference of the blended coverage from the mask, where its border is near."""
         covered = hits.face.ravel() >= 0
         outer = np.nonzero(~covered[pairs.far])[0]
-        near, far = (torch.from_numpy(side[outer]).to(self.device) for side in (pairs.near, pairs.far))
+        near, far = (torch.from_numpy(side[outer]) for side in (pairs.near, pairs.far))
         coverage = blend(self._tensor(covered.astype(np.float64))[:, None], near, far, crossing[outer])[:, 0]
         return ((coverage - self._tensor(person.astype(np.float64))).abs() * self._tensor(near_border * 1.0)).mean()
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device, self.dtype)
+        return torch.from_numpy(np.ascontiguousarray(array)).to(torch.float32)
 
     # ------------------------------------------------------------------ descent
     def total(self, losses: dict[str, torch.Tensor]) -> torch.Tensor:
@@ -254,7 +253,7 @@ class ReferenceSolver:
             keys = [key for key in arrays if key.startswith(f"{name}.")]
             state = {key.partition(".")[2]: torch.from_numpy(np.array(arrays[key])) for key in keys}
             if state:
-                self.optimiser.state[tensor] = {k: v if k == "step" else v.to(self.device) for k, v in state.items()}
+                self.optimiser.state[tensor] = {k: v for k, v in state.items()}
         self.iteration, self._still = int(arrays["iteration"]), None
         self._seen.clear()
 
@@ -265,9 +264,9 @@ class _ModelLight(torch.autograd.Function):
     @staticmethod
     def forward(ctx, parameters, model):
         ctx.model, ctx.at = model, parameters.detach().cpu().double().numpy()
-        return torch.from_numpy(model.radiance(ctx.at)).to(parameters.device, parameters.dtype)
+        return torch.from_numpy(model.radiance(ctx.at)).to(parameters.dtype)
 
     @staticmethod
     def backward(ctx, gradient):
         values = ctx.model.adjoint(ctx.at, gradient.detach().cpu().double().numpy())
-        return torch.from_numpy(values).to(gradient.device, gradient.dtype), None
+        return torch.from_numpy(values).to(gradient.dtype), None

@@ -55,6 +55,13 @@ def frames_about(axis: np.ndarray) -> np.ndarray:
     return np.stack([first, second, axis], axis=1)
 
 
+def mirrored_about_axis(roughness: float) -> tuple[np.ndarray, np.ndarray]:
+    """A lobe along its own axis, +z ([Karis2013]: n = o = r): directions [M, 3] and their weights, the cosines [M]."""
+    half = sample_half_vectors(roughness)
+    local = 2.0 * half[:, 2:] * half - np.array([0.0, 0.0, 1.0])
+    return local[local[:, 2] > 0], local[local[:, 2] > 0, 2]
+
+
 class SplitSum:
     """Weights of narrow lobes on directions [J, 3]."""
 
@@ -75,9 +82,7 @@ class SplitSum:
 
     def prefilter(self, reflected: np.ndarray, roughness: float) -> np.ndarray:
         """[P, 3] reflected directions -> weights [P, J] that sum to 1: the lobe seen along its own axis."""
-        half = sample_half_vectors(roughness)
-        local = 2.0 * half[:, 2:] * half - np.array([0.0, 0.0, 1.0])
-        local, cosine = local[local[:, 2] > 0], local[local[:, 2] > 0, 2]
+        local, cosine = mirrored_about_axis(roughness)
         world = local @ frames_about(reflected)
         texel = cube_texel(world.reshape(-1, 3), _TABLE_RESOLUTION)
         count, total = len(reflected), len(self.directions)

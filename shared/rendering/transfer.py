@@ -24,7 +24,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shared.geometry.mesh import Mesh, normalised, vertex_normals
-from shared.geometry.raycast import RayScene
+from shared.geometry.raycast import RAY_START_MM, RayScene
 
 _RAYS_PER_BATCH = 2_000_000
 _NORMAL_MATTERS_MM = 12.0
@@ -145,22 +145,21 @@ def trace_transfer(
     points: Points,
     nodes: Nodes,
     directions: np.ndarray,
-    offset: float = 0.05,
     progress=iter,
     visibility: bool = True,
 ) -> Transfer:
     """Traces every direction above each point's horizon, once.
 
-    directions [J, 3] unit, uniform (each 4 pi / J sr); offset: how far above the surface rays start, mm; progress:
-    wraps the sequence of batches to show how far it is; visibility off: every point sees all directions above its
-    horizon, as on a convex surface, and nothing bounces.
+    directions [J, 3] unit, uniform (each 4 pi / J sr); progress: wraps the sequence of batches to show how far it is;
+    visibility off: every point sees all directions above its horizon, as on a convex surface, and nothing bounces.
     """
     count, total = len(points), len(directions)
     direct = np.zeros((count, total), np.float16)
     bounce = np.zeros((count, len(nodes.points)), np.float16)
     blocked = np.zeros(count, np.float32)
     visible = np.zeros((count, (total + 7) // 8), np.uint8)
-    starts, along_rays = (np.asarray(x, np.float32) for x in (points.positions + offset * points.normals, directions))
+    starts = points.positions + RAY_START_MM * points.normals
+    starts, along_rays = (np.asarray(x, np.float32) for x in (starts, directions))
     batch = max(1, 2 * _RAYS_PER_BATCH // total)
     for start in progress(range(0, count, batch)):
         part = slice(start, min(start + batch, count))

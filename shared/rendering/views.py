@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shared.geometry.mesh import Mesh, interpolate, normalised
-from shared.geometry.raycast import camera_hits
+from shared.geometry.raycast import RAY_START_MM, camera_hits
 from shared.geometry.transforms import camera_centres, rigid, world_from_head
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
@@ -34,6 +34,8 @@ ORIENTATION_MM = 40.0
 EDGE_COSINE = -0.1
 """Vertices that turn away from a camera by more than this show in no triangle that it sees."""
 RELIT_YAW_DEG = -15.0
+SAMPLES = 2
+"""Rays along each edge of a pixel that tell how much of it the head covers."""
 HELD_OUT_SHOWN = 4
 """Held-out frames that the report re-renders beside the others."""
 
@@ -154,7 +156,7 @@ class HeadViews:
         for camera in cameras:
             towards = self._towards(camera, self.viewer.mesh.vertices)
             front = np.nonzero((towards * self.viewer.normals).sum(1) > EDGE_COSINE)[0]
-            starts = self.viewer.mesh.vertices[front] + self.viewer.offset * self.viewer.normals[front]
+            starts = self.viewer.mesh.vertices[front] + RAY_START_MM * self.viewer.normals[front]
             seen[front[~self.viewer.scene.occluded(starts, towards[front])]] = True
         return self.viewer.grown(seen)
 
@@ -212,15 +214,15 @@ class HeadViews:
             return self._lit
         return self._lit.under(light, poses, moves)
 
-    def coverage(self, camera: ViewCamera, samples: int = 2) -> np.ndarray:
+    def coverage(self, camera: ViewCamera) -> np.ndarray:
         """[h, w] in 0 .. 1: how much of each pixel the head covers, as render counts it."""
         covered = np.zeros(camera.size[::-1])
-        for row in range(samples):
-            for column in range(samples):
-                offsets = (column + 0.5) / samples, (row + 0.5) / samples
+        for row in range(SAMPLES):
+            for column in range(SAMPLES):
+                offsets = (column + 0.5) / SAMPLES, (row + 0.5) / SAMPLES
                 pose, lens = camera.camera_from_head, camera.intrinsics
                 covered += camera_hits(self.viewer.scene, pose, lens, *camera.size, offsets)[0] >= 0
-        return covered / samples**2
+        return covered / SAMPLES**2
 
     def visibility(self, camera: ViewCamera, roughness: float) -> np.ndarray:
         """[h, w]: share of a lobe of this roughness about the reflected direction that the head leaves open; NaN beside

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from shared.geometry.mesh import Mesh, vertex_normals
+from shared.geometry.mesh import Mesh, mesh_edges, vertex_normals
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import project
 from shared.tracking.tracks import visible_vertices
@@ -45,8 +45,7 @@ def _coarse_edges(faces: np.ndarray) -> np.ndarray:
     """Edges [E, 2] of the mesh before its last subdivision, whose four children stand together, corners first."""
     coarse = faces.reshape(-1, 4, 3)
     corners = np.stack([coarse[:, 0, 0], coarse[:, 1, 1], coarse[:, 2, 2]], axis=1)
-    pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-    return np.unique(np.sort(pairs, axis=1), axis=0)
+    return mesh_edges(corners)[0]
 
 
 def _fixed(points: np.ndarray) -> np.ndarray:

@@ -21,6 +21,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
+from shared.compute.robust import cauchy_weight
 from shared.imaging.image_sampling import is_inactive
 from shared.rendering.normal_derivatives import ShadingTerms
 from shared.rendering.transfer import spread_vertices
@@ -146,7 +147,7 @@ def _fit_albedo(samples, irradiance, highlights, fitted, noise, uncertainty) -> 
         albedo = (used * (samples.colours - highlights)).sum(1) / np.maximum((used * irradiance).sum(1), 1e-9)
         albedo = np.clip(albedo, MINIMUM_ALBEDO, MAXIMUM_ALBEDO)
         error = albedo[:, None] * irradiance + highlights - samples.colours
-        weight = base * ~is_inactive(samples.saturation, error) / (1.0 + (error / (CAUCHY_SCALE * sigma)) ** 2)
+        weight = cauchy_weight(error, CAUCHY_SCALE * sigma, base * ~is_inactive(samples.saturation, error))
     return albedo, weight
 
 

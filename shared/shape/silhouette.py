@@ -19,6 +19,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
+from shared.compute.robust import cauchy_weight
 from shared.compute.run_context import SILENT, RunContext
 from shared.geometry.mesh import Mesh, loop_subdivision, mesh_edges, normalised, vertex_normals
 from shared.geometry.raycast import RayScene
@@ -171,8 +172,8 @@ def _step(spread, prior, moved, contour: OccludingContour, fitted: np.ndarray, s
     """Change [C, 3] of the displacement moved [C, 3] of the vertices before the subdivision."""
     used, count = fitted[contour.frame], spread.shape[0]
     distance, slope = contour.distance[used], contour.slope[used]
-    weight = 1.0 / (settings.sigma_px**2 * settings.correlated)
-    weight = weight / (1.0 + (distance / (CAUCHY_SCALE * settings.sigma_px)) ** 2)
+    own = 1.0 / (settings.sigma_px**2 * settings.correlated)
+    weight = cauchy_weight(distance, CAUCHY_SCALE * settings.sigma_px, own)
     ends = np.stack([1.0 - contour.share[used], contour.share[used]], axis=1)
     entries = np.repeat(np.arange(len(distance)), 2), contour.edge[used].ravel()
     at = sparse.csr_matrix((ends.ravel(), entries), (len(distance), count)) @ spread

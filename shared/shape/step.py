@@ -6,7 +6,7 @@ around them by the derivative of angle-weighted vertex normals. The prior is on 
     1/2 |(I + lambda L) d|^2 / sigma^2,
 
 the metric in which large steps descend: neighbours move together over some sqrt(lambda) edges, and what nothing pulls
-stays where it was. L is the combinatorial Laplacian.
+stays where it was. L is the graph's Laplacian.
 
 Reference: [Nicolet2021].
 """
@@ -20,7 +20,8 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
-from shared.geometry.mesh import face_normals, normalised, vertex_adjacency
+from shared.compute.robust import cauchy_weight
+from shared.geometry.mesh import face_normals, graph_laplacian, normalised
 from shared.geometry.raycast import RayScene
 from shared.geometry.surface import TrackPoints
 
@@ -71,9 +72,7 @@ def normal_turns(
 
 def large_step_metric(faces: np.ndarray, count: int, smoothness: float, sigma_mm: float) -> sparse.csr_matrix:
     """[V, V]: (I + lambda L)^T (I + lambda L) / sigma^2, smoothness = lambda."""
-    adjacency = vertex_adjacency(faces, count)
-    laplacian = sparse.diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency
-    root = (sparse.identity(count) + smoothness * laplacian) / sigma_mm
+    root = (sparse.identity(count) + smoothness * graph_laplacian(faces, count)) / sigma_mm
     return (root.T @ root).tocsr()
 
 
@@ -93,7 +92,7 @@ def track_rows(
     lift = (normals[faces[face]] * along[:, None]).sum(2)
     rows = np.repeat(np.arange(len(face)), 3)
     matrix = sparse.csr_matrix(((bary * lift).ravel(), (rows, faces[face].ravel())), (len(face), len(vertices)))
-    return matrix, height, 1.0 / sigma**2 / (1.0 + (height / (2.5 * sigma)) ** 2)
+    return matrix, height, cauchy_weight(height, 2.5 * sigma, 1.0 / sigma**2)
 
 
 def solve_offsets(

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from shared.compute.robust import ROBUST_SCALE
+from shared.compute.robust import ROBUST_SCALE, cauchy_weight
 from shared.geometry.mesh import normalised
 from shared.geometry.transforms import camera_centres, projection_slope
 from shared.tracking.bundle import BundleSolution
@@ -44,7 +44,7 @@ def depth_noise(solution: BundleSolution, reliable: np.ndarray, intrinsics: np.n
     residual = solution.residuals_px[reliable]
     poses, points = solution.camera_from_points[reliable], solution.points
     error = np.linalg.norm(residual, axis=-1)
-    weight = np.isfinite(error) / (1.0 + (np.nan_to_num(error) / (CAUCHY * np.nanmedian(error))) ** 2)
+    weight = cauchy_weight(np.nan_to_num(error), CAUCHY * np.nanmedian(error), np.isfinite(error))
     residual = np.nan_to_num(residual)
     slope = np.stack([projection_slope(points, pose, intrinsics) for pose in poses])
     view = normalised(normalised(camera_centres(poses)).mean(0))

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 from scipy.spatial import cKDTree
 
+from shared.compute.robust import cauchy_weight
 from shared.geometry.mesh import interpolate, vertex_normals
 from shared.geometry.transforms import project, rotation_from_vector, similarity_from_points
 from shared.tracking.depth_noise import DepthNoise
@@ -191,7 +192,7 @@ def _closest(vertices, normals, usable, points, reach_mm):
     near = usable[index]
     offset = ((points - vertices[near]) * normals[near]).sum(1)
     spread = 3.0 * np.median(np.abs(offset)) + 0.05
-    return near, offset, (distance < reach_mm) / (1.0 + (offset / spread) ** 2)
+    return near, offset, cauchy_weight(offset, spread, distance < reach_mm)
 
 
 def landmarks_on_points(

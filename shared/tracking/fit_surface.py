@@ -14,7 +14,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from shared.compute.robust import ROBUST_SCALE
+from shared.compute.robust import ROBUST_SCALE, cauchy_weight
 from shared.geometry.mesh import interpolate, uniform_laplacian, vertex_normals
 from shared.geometry.raycast import RayScene, on_faces
 from shared.tracking.depth_noise import DepthNoise
@@ -99,5 +99,5 @@ def _under(model: HeadModel, vertices: np.ndarray, points: np.ndarray, reach_mm:
     offset = distance - reach_mm  # of the point above the surface
     near = (np.abs(offset) < reach_mm) & ((interpolate(normals, model.faces, face, bary) * along).sum(1) > 0.5)
     face, bary, offset, along = face[near], bary[near], offset[near], along[near]
-    weight = 1.0 / (1.0 + (offset / (3.0 * np.median(np.abs(offset)) + 0.05)) ** 2)
+    weight = cauchy_weight(offset, 3.0 * np.median(np.abs(offset)) + 0.05)
     return _Under(face, bary, offset, along, weight)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.compute.robust import ROBUST_SCALE
+from shared.compute.robust import ROBUST_SCALE, cauchy_weight
 from shared.geometry.transforms import vector_from_rotation
 
 LEAST_FRAMES = 8
@@ -56,7 +56,7 @@ class MotionPrior:
     def normal_equations(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """-> normal matrices [6, F, F] and right-hand sides [6, F], one for each axis."""
         operator, acceleration = self.operator(), self.acceleration(poses)
-        weight = 1.0 / (1.0 + (acceleration / (JERK_DEVIATIONS * self.deviation)) ** 2) / self.deviation**2
+        weight = cauchy_weight(acceleration, JERK_DEVIATIONS * self.deviation) / self.deviation**2
         matrices = np.stack([operator.T @ (weight[:, [axis]] * operator) for axis in range(6)])
         return matrices, -(operator.T @ (weight * acceleration)).T
 

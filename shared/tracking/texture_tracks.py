@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from shared.compute.robust import cauchy_weight
 from shared.geometry.atlas import Atlas, PlacedFrame, sample
 
 LEAST_COVER = 0.6
@@ -47,7 +48,7 @@ def mean_texture(frames: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]) 
     """
     mean, spread, _ = _moments(frames(), lambda image, weight: weight)
     scale = OUTLIER_SPREADS * spread
-    mean, spread, seen = _moments(frames(), lambda image, weight: weight / (1.0 + ((image - mean) / scale) ** 2))
+    mean, spread, seen = _moments(frames(), lambda image, weight: cauchy_weight(image - mean, scale, weight))
     return MeanContrast(mean.astype(np.float32), spread.astype(np.float32), seen.astype(np.float32))
 
 
@@ -85,7 +86,7 @@ def track_frame(
     for step in range(windows.steps):
         layout = placed.layout if step == 0 else _shifted(placed.layout, columns, rows, offset)
         difference = sample(picture, layout, cv2.INTER_CUBIC).astype(np.float32) - texture.mean
-        weight = known / (1.0 + (difference / (OUTLIER_SPREADS * texture.spread)) ** 2)
+        weight = cauchy_weight(difference, OUTLIER_SPREADS * texture.spread, known)
         sums = _window_sums(gradient, difference, known, weight, windows.sigma)
         offset -= sums.offset()
         np.clip(offset, -2.0 * windows.search, 2.0 * windows.search, out=offset)

@@ -3,13 +3,13 @@ of it, and its weight against the priors."""
 
 import numpy as np
 import pytest
+from field_check import below, field_faults
 from toy_chart import CENTRED, chart_pose
 from toy_head import toy_head
 
 from shared.appearance.albedo_scale import Highlights, resolve_scale
 from shared.appearance.chart_scale import chart_normals, describe_scale, scale_warnings, state_chart
 from shared.capture.chart import CORNERS, PATCHES, ChartObservation, patch_sigma, reflectances, usable
-from shared.contract.fields import below, field_faults
 from shared.contract.records import SOLVE
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import WORLD_FROM_CAMERA, rigid

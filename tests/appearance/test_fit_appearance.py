@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from field_check import below, field_faults
 from toy_capture import (
     DIRECTIONS,
     MATTE,
@@ -19,7 +20,6 @@ from toy_capture import (
 from shared.appearance.fit import fit_appearance
 from shared.appearance.problem import AppearanceSettings
 from shared.appearance.projection import changed_roughness
-from shared.contract.fields import below, field_faults
 from shared.contract.records import SOLVE
 from shared.geometry.mesh import normalised
 from shared.geometry.transforms import fibonacci_sphere

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from field_check import below, field_faults
 from toy_chart import chart_pose, draw_chart
 
 from shared.capture.chart import COLUMNS, CORNERS, NEUTRAL, PATCHES, fit_chart, reflectances
 from shared.capture.chart_finder import LEAST_LIKENESS, clipping_limit, find_chart, read_chart
 from shared.capture.chart_watch import ChartWatch
 from shared.contract.chart_place import AUTO, ChartPlace
-from shared.contract.fields import below, field_faults
 from shared.contract.records import FRAMES
 from shared.imaging.color import decode_bt709, decode_srgb, encode_srgb
 

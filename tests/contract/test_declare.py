@@ -5,6 +5,7 @@ from toy_runs import READ_TEXT, copy_pipeline, make_subject
 
 from shared.contract import Output, Parameter, Stage, load_subject
 from shared.contract.chart_place import AUTO
+from shared.contract.cli import make_parser
 from shared.contract.declare import parameter_table
 from shared.contract.folders import RunFolder
 from shared.contract.hashing import HashMemory
@@ -18,7 +19,7 @@ from tools.limn import main
 
 @pytest.mark.parametrize("name, value, parsed", [
     ("size", "20", 20), ("size", 20.0, 20), ("size", "2e1", 20), ("limit", "1e-3", 1e-3), ("limit", 2, 2.0),
-    ("limit", "none", None), ("limit", None, None), ("fast", "yes", True), ("fast", False, False), ("seed", "7", 7)])
+    ("limit", "none", None), ("limit", None, None), ("fast", "yes", True), ("fast", False, False)])
 def test_values_are_typed(name, value, parsed):
     result = READ_TEXT.parse({name: value}, "here")[name]
     assert result == parsed and type(result) is type(parsed)
@@ -28,7 +29,7 @@ def test_values_are_typed(name, value, parsed):
     ("size", 0, "1 .. 100 texels"), ("size", 101, "1 .. 100"), ("size", "1.5", "whole number"), ("size", True, "whole"),
     ("size", None, "whole number"), ("size", "nan", "whole"), ("limit", "inf", "a number >= 0 mm"),
     ("limit", [1], "number"), ("letters", "loud", "one of lower, upper"), ("fast", "perhaps", "true or false"), 
-    ("sise", 1, "read_text.size?"), ("seed", -1, "0 .. ")])
+    ("sise", 1, "read_text.size?"), ("seed", 1, "leave it out")])
 def test_bad_values_say_what_is_allowed(name, value, hint):
     with pytest.raises(InputError, match=name) as error:
         READ_TEXT.parse({name: value}, "here")
@@ -47,6 +48,16 @@ def test_a_former_name_is_refused_with_the_new_one(tmp_path, capsys):
     assert "write sample_frames.min_sharpness" in line and line.count("\n") == 1
 
 
+@pytest.mark.parametrize("name, line", [
+    ("seed", "parameter inverse_render.seed has another name now; write inverse_render.reference_seed"),
+    ("reference_device", "parameter inverse_render.reference_device is no more; leave it out: the published solver "
+     "computes on the processor")])
+def test_a_parameter_that_is_no_more_is_refused_with_what_to_do(name, line):
+    with pytest.raises(InputError) as error:
+        inverse_render.STAGE.parse({name: "1"}, "--set")
+    assert str(error.value) == f"--set: {line}"
+
+
 def test_a_former_name_is_no_other_parameter_s():
     size = Parameter("size", int, 1, "Size.")
     output = Output("words.txt", "Words.")
@@ -60,9 +71,30 @@ def test_bad_default_is_refused():
 
 
 def test_table_lists_every_parameter():
-    rows = parameter_table([READ_TEXT]).splitlines()
+    rows = parameter_table({"read_text": READ_TEXT.parameters}).splitlines()
     assert len(rows) == 2 + len(READ_TEXT.parameters)
     assert "| read_text | `size` | `10` | 1 .. 100 | texels | Size. |" in rows
+
+
+def test_groups_are_listed_when_they_are_asked_for(capsys):
+    """The default's lists end with one line that says how; each parameter stands in one list."""
+    stage, (group,) = inverse_render.STAGE, inverse_render.STAGE.groups
+    assert (*stage.common, *group.parameters) == stage.parameters and len(group.parameters) == 18
+    assert stage.parse({"reference_pixels": 9}, "--set") == {"reference_pixels": 9}
+    assert main(["parameters"]) == 0
+    listed = capsys.readouterr().out
+    assert "| inverse_render | `map_size` |" in listed and "reference_" not in listed
+    assert listed.endswith("limn parameters --group published\n")
+    assert main(["parameters", "--group", "published"]) == 0
+    rows = capsys.readouterr().out.splitlines()
+    assert len(rows) == 2 + 18 and all("| inverse_render | `reference_" in row for row in rows[2:])
+    assert main(["parameters", "--group", "publishd"]) == 2 and "did you mean published?" in capsys.readouterr().err
+    for option, inside, outside in (("", "map_size", "reference_"), ("-published", "reference_", "map_size")):
+        with pytest.raises(SystemExit) as done:
+            make_parser(stage).parse_args([f"--help{option}"])
+        told = capsys.readouterr().out
+        assert done.value.code == 0 and f"\n  {inside}" in told and f"\n  {outside}" not in told
+    assert "--help-published" in make_parser(stage).format_help()
 
 
 def test_subject_facts(tmp_path):

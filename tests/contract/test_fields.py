@@ -4,8 +4,9 @@ import json
 
 import numpy as np
 import pytest
+from field_check import below, field_faults, written_fields
 
-from shared.contract.fields import Field, below, field_faults, written_fields
+from shared.contract.declare import Field
 from shared.contract.pipeline import load_pipeline
 from shared.contract.records import MANIFEST, PROVENANCE
 from tools.documents.readme import README

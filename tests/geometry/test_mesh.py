@@ -24,6 +24,26 @@ def test_laplacian_of_a_linear_function_vanishes_inside():
     assert np.abs((m.uniform_laplacian(plane.faces, len(plane.vertices)) @ plane.vertices)[inside]).max() < 1e-12
 
 
+def test_both_laplacians_know_the_number_of_neighbours():
+    """Of a fan of three triangles about vertex 0, whose neighbours are all others."""
+    faces, values = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4]]), np.array([10.0, 1.0, 2.0, 3.0, 4.0])
+    whole, mean = (f(faces, 5) for f in (m.graph_laplacian, m.uniform_laplacian))
+    assert (whole != whole.T).nnz == 0 and not (whole @ np.ones(5)).any()
+    assert (whole @ values)[0] == 4 * 10.0 - (1.0 + 2.0 + 3.0 + 4.0)
+    assert np.allclose(mean @ values, (whole @ values) / whole.diagonal())
+
+
+def test_the_rim_of_a_surface_in_its_faces_orientation():
+    plane = grid_plane(4)
+    rim = m.boundary_loop(plane.faces)
+    steps = set(zip(rim.tolist(), np.roll(rim, -1).tolist(), strict=True))
+    assert len(rim) == len(steps) == 4 * 3 and rim[0] == rim.min()
+    assert steps <= set(map(tuple, m.half_edges(plane.faces).tolist()))
+    two = np.concatenate([plane.faces, plane.faces + len(plane.vertices)])
+    with pytest.raises(ValueError, match="more than one boundary"):
+        m.boundary_loop(two)
+
+
 def test_midpoints_lie_in_the_middle_and_keep_the_area():
     plane = grid_plane(4)
     matrix, faces = m.midpoint_subdivision(plane.faces, len(plane.vertices))

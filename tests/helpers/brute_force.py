@@ -10,7 +10,7 @@ import numpy as np
 
 from shared.rendering import brdf
 from tools.synthesis.light import EnvironmentLight
-from tools.synthesis.sampling import cosine_direction, tangent_frame
+from tools.synthesis.sampling import tangent_frame
 from tools.synthesis.surface import ShadingPoints, SyntheticSurface
 
 
@@ -44,7 +44,7 @@ def reference_radiance(surface: SyntheticSurface, light: EnvironmentLight, world
 def _first_directions(normal: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """[N, 3] directions above the shading normal and their density [N]: half cosine, half uniform."""
     square = rng.random((len(normal), 2))
-    cosine_weighted = cosine_direction(square)
+    cosine_weighted = _cosine_direction(square)
     height = square[:, 0]
     ring = np.sqrt(1 - height * height)
     phi = 2 * np.pi * square[:, 1]
@@ -69,8 +69,14 @@ def _incident(surface: SyntheticSurface, light: EnvironmentLight, world_from_hea
     second = surface.points(face[met], bary[met])
     outer = (second.geometric_normal * directions[met]).sum(1) < 0
     met, second = met[outer], second.select(outer)
-    onwards = _from_frame(cosine_direction(rng.random((len(met), 2))), second.normal)
+    onwards = _from_frame(_cosine_direction(rng.random((len(met), 2))), second.normal)
     above = (onwards * second.geometric_normal).sum(1) > 0
     free = above & ~surface.scene.occluded(second.origins, onwards)
     radiance[met] = surface.albedo(second.uv) * light.radiance(onwards @ world_from_head.T) * free[:, None]
     return radiance
+
+
+def _cosine_direction(points: np.ndarray) -> np.ndarray:
+    """Points [N, 2] of the unit square -> directions [N, 3] about +z with density cos / pi."""
+    radius, phi = np.sqrt(points[..., 0]), 2 * np.pi * points[..., 1]
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), np.sqrt(1.0 - points[..., 0])], -1)

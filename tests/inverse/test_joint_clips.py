@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from field_check import field_faults
 from quick import QUICK, TINY
 from shapes import grid_plane
 from toy_head import toy_head
 
-from shared.contract.fields import field_faults
 from shared.contract.records import RUN, SOLVE, SOLVED_POSES
 from shared.errors import InputError
 from shared.geometry.mesh import interpolate, vertex_normals

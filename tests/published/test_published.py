@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from field_check import field_faults, written_fields
 from toy_clip import FRAMES, MAP, toy_clip, true_maps
 
 from shared.compute.run_context import SILENT, RunContext
-from shared.contract.fields import field_faults, written_fields
 from shared.contract.job import Parameters
 from shared.contract.records import SOLVE
-from shared.errors import InputError
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.inverse.frame_choice import covering_frames
 from shared.inverse.parameters import read_settings
@@ -205,14 +204,12 @@ def test_the_stage_hands_its_parameters_on():
             specular=False,
             light_model="sun_sky",
             reference_pixels=100,
+            reference_seed=3,
         )
     ).reference
     assert changed.sampling == Sampling(32, 256, 64, visibility=False, specular=False)
-    assert (changed.weights.mask, changed.light_model, changed.pixels) == (0.5, "sun_sky", 100)
+    assert (changed.weights.mask, changed.light_model, changed.pixels, changed.seed) == (0.5, "sun_sky", 100, 3)
     assert read_settings(told()).reference is None
-    if not torch.cuda.is_available():
-        with pytest.raises(InputError, match="reference_device"):
-            read_settings(told(solver="reference", reference_device="cuda"))
 
 
 def test_checkpoints_know_what_they_belong_to(clip):

@@ -63,7 +63,7 @@ def manifest(data: bytes) -> None:
     (FOLDER / "provenance.json").write_text("{}")
     found = read_manifest(FOLDER)
     if found is not None:
-        Work("read_text", 1, {"a": 1}, 0, {"video": "0"}).reasons(found)
+        Work("read_text", 1, {"a": 1}, {"video": "0"}).reasons(found)
         outputs_digest(found)
         damage(FOLDER, found, HashMemory(FOLDER / "memory.json"))
 
@@ -122,7 +122,7 @@ def seeds(name: str) -> list[bytes]:
                     "colour: {transfer: srgb}\ncapture: {moves: head}\n",
                     "video: clip.mp4\ntracking: {landmarks: clip.mp4, poses: clip.mp4, hold_poses: true}\n"],
         "pipeline": [(ROOT / "pipeline.yaml").read_text(), "stages:\n  sample_frames: {needs: [], threads: 1}\n"],
-        "manifest": ['{"schema": 1, "stage": "a", "version": 1, "parameters": {"a": 1}, "seed": 0, "inputs": {}, '
+        "manifest": ['{"schema": 1, "stage": "a", "version": 1, "parameters": {"a": 1}, "inputs": {}, '
                      '"outputs": {"subject.yaml": {"sha256": "0", "bytes": 3}, "b": {"volatile": true}}}'],
         "provenance": ['{"python": "3.11.7", "packages": {"numpy": "2.4.6"}, '
                        '"code": {"shared/rendering/brdf.py": "0"}, '

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from field_check import below, field_faults
 from toy_capture import (
     NOISE,
     ROUGHNESS,
@@ -21,7 +22,6 @@ from toy_head import toy_head
 from shared.appearance.fit import Solution
 from shared.appearance.problem import AppearanceSettings
 from shared.compute.run_context import SILENT, RunContext
-from shared.contract.fields import below, field_faults
 from shared.contract.job import Parameters
 from shared.contract.records import LADDER_TIMES, RUN, SOLVE
 from shared.errors import InputError

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scipy.sparse as sparse
+from field_check import below, field_faults
 from shapes import sphere
 from toy_head import toy_head
 from toy_shape import FRAMES, LENS, ROUGHNESS, SIZE, SIZES, SPECULAR, shade, swinging, true_albedo, true_light
 
 from shared.appearance.problem import AppearanceSettings
-from shared.contract.fields import below, field_faults
 from shared.contract.records import SOLVE
 from shared.geometry.mesh import Mesh, interpolate, normalised, tangent_frames, vertex_normals
 from shared.geometry.raycast import RayScene, camera_hits

@@ -5,6 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+from field_check import field_faults
 from toy_chart import draw_chart
 from toy_video import DrawnFaceNetworks, drawn_face, turning_face, write_video
 
@@ -12,7 +13,6 @@ from shared.capture.clip_survey import ClipSurvey
 from shared.capture.face_tracker import FaceTracker
 from shared.capture.landmarks import EYE_LEFT, EYE_RIGHT, OVAL
 from shared.contract import main
-from shared.contract.fields import field_faults
 from shared.contract.records import FRAMES
 from shared.geometry.transforms import rotation_from_vector
 from shared.imaging.color import decode_srgb

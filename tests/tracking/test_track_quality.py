@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from field_check import below, field_faults
 
-from shared.contract.fields import below, field_faults
 from shared.contract.records import TRACKING
 from shared.geometry.transforms import rigid, rotation_from_vector, rotation_range_deg
 from shared.tracking.track_head import HeadTrack

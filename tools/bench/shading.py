@@ -26,6 +26,7 @@ import torch
 
 from shared.appearance.observations import face_front
 from shared.geometry.mesh import Mesh, normalised, subdivide
+from shared.geometry.transforms import camera_centres
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.io.images import write_exr
 from shared.published.raster import Raster
@@ -111,7 +112,7 @@ class TracedView:
         table = SpecularTransfer(points.normals, self.transfer.visibility(), self.precomputed.directions)
         table.narrowest = 2.0 if split else 0.0
         camera = self.camera.camera_from_head
-        towards = normalised(-camera[:3, 3] @ camera[:3, :3] - points.positions)
+        towards = normalised(camera_centres(camera) - points.positions)
         return self._picture(None, specular_reflection(table, towards, roughness, self.along), (0.0, 0.0, 0.0))
 
     def published(self, coat: Coat, samples: int, seed: int = 0) -> np.ndarray:

@@ -9,8 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 
-from shared.contract.declare import Output, Stage, parameter_table
-from shared.contract.fields import Field
+from shared.contract.declare import Field, Output, Stage, parameter_table
 from shared.contract.models import FACE_NETWORKS
 from shared.contract.pipeline import Pipeline, load_pipeline
 from shared.contract.records import MANIFEST, PROVENANCE
@@ -78,8 +77,11 @@ def _shown(value: object) -> str:
 
 
 def parameter_sections(stages: Sequence[Stage]) -> str:
-    """Every stage's parameters, as `limn parameters` lists them."""
-    return "\n".join(f"## {stage.name}\n\n{stage.help}\n\n{parameter_table([stage])}" for stage in stages)
+    """Every stage's parameters, as `limn parameters` lists them; groups that count in one case only at the end."""
+    sections = [f"## {stage.name}\n\n{stage.help}\n\n{parameter_table({stage.name: stage.common})}" for stage in stages]
+    sections += [f"## {stage.name}: {group.name}\n\nParameters {group.case}.\n\n"
+                 f"{parameter_table({stage.name: group.parameters})}" for stage in stages for group in stage.groups]
+    return "\n".join(sections)
 
 
 # ---------------------------------------------------------------------- files

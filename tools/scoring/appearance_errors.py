@@ -9,7 +9,7 @@ import numpy as np
 
 from shared.geometry.mesh import Mesh, interpolate
 from shared.geometry.raycast import RayScene, camera_hits
-from shared.imaging.color import delta_e_2000, encode_srgb
+from shared.imaging.color import encode_srgb
 from shared.imaging.texture import sample_bilinear
 from shared.inverse.clip_inputs import ClipInputs
 from shared.inverse.problem import InverseResult
@@ -58,38 +58,36 @@ def map_errors(
 
 
 def _albedo_errors(truth: np.ndarray, found: np.ndarray, confidence: np.ndarray) -> dict:
-    gain = measures.channel_gain(truth.astype(np.float64), found)
-    aligned = delta_e_2000(np.clip(truth, 0, None), np.clip(found * gain, 0, None))
-    raw = delta_e_2000(np.clip(truth, 0, None), np.clip(found, 0, None))
+    """[N, 3] pairs and confidence [N]: all of them, and those where the clip saw light, with gains from there: what it
+    did not see must not set them."""
+    errors, apart, gain = _aligned_errors(truth, found)
+    sure = confidence > CONFIDENT
+    confident = _aligned_errors(truth[sure], found[sure])[0] if sure.any() else dict.fromkeys(errors, float("nan"))
     edges = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 0.97, 1.001])
     bins = [(confidence >= low) & (confidence < high) for low, high in zip(edges[:-1], edges[1:], strict=True)]
     calibration = [
-        [float(low), int(inside.sum()), float(np.median(aligned[inside])) if inside.any() else None]
+        [float(low), int(inside.sum()), float(np.median(apart[inside])) if inside.any() else None]
         for low, inside in zip(edges[:-1], bins, strict=True)
     ]
     return {
-        **_confident_errors(truth, found, confidence > CONFIDENT),
-        "delta_e2000_median": float(np.median(aligned)),
-        "delta_e2000_p90": float(np.percentile(aligned, 90)),
-        "delta_e2000_raw_median": float(np.median(raw)),
-        "psnr_linear": measures.psnr(truth, found * gain),
+        **{f"confident_{name}": value for name, value in confident.items()},
+        **errors,
+        "delta_e2000_raw_median": float(np.median(measures.albedo_differences(truth, found))),
         "gain": [round(float(value), 4) for value in gain],
         "calibration": calibration,
     }
 
 
-def _confident_errors(truth: np.ndarray, found: np.ndarray, sure: np.ndarray) -> dict:
-    """Where the clip saw light, with gains from there: what it did not see must not set them."""
-    if not sure.any():
-        return {f"confident_{name}": float("nan") for name in ("delta_e2000_median", "delta_e2000_p90", "psnr_linear")}
-    truth, found = truth[sure].astype(np.float64), found[sure]
-    found = found * measures.channel_gain(truth, found)
-    apart = delta_e_2000(np.clip(truth, 0, None), np.clip(found, 0, None))
-    return {
-        "confident_delta_e2000_median": float(np.median(apart)),
-        "confident_delta_e2000_p90": float(np.percentile(apart, 90)),
-        "confident_psnr_linear": measures.psnr(truth, found),
+def _aligned_errors(truth: np.ndarray, found: np.ndarray) -> tuple[dict, np.ndarray, np.ndarray]:
+    """After one gain per channel: the errors of [N, 3] pairs, the dE2000 of each [N], and the gains [3]."""
+    gain = measures.channel_gain(truth.astype(np.float64), found)
+    apart = measures.albedo_differences(truth, found * gain)
+    errors = {
+        "delta_e2000_median": float(np.median(apart)),
+        "delta_e2000_p90": float(np.percentile(apart, 90)),
+        "psnr_linear": measures.psnr(truth, found * gain),
     }
+    return errors, apart, gain
 
 
 def light_errors(subject: Path, latlong: np.ndarray) -> dict:

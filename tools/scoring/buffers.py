@@ -9,6 +9,7 @@ import numpy as np
 
 from shared.geometry.mesh import Mesh, interpolate, normalised, vertex_normals
 from shared.geometry.raycast import RayScene
+from shared.geometry.transforms import camera_centres
 from shared.imaging.texture import sample_bilinear
 
 
@@ -51,9 +52,8 @@ class BufferRenderer:
         """One ray per image point [N,2]: indices of the hits [M] and the surface's values there."""
         centre, focal = intrinsics[:2, 2], intrinsics[[0, 1], [0, 1]]
         directions = np.concatenate([(points_px - centre) / focal, np.ones((len(points_px), 1))], 1)
-        rotation, translation = camera_from_head[:3, :3], camera_from_head[:3, 3]
-        origins = np.broadcast_to(-translation @ rotation, directions.shape)
-        face, bary, _ = self._scene.intersect(origins, directions @ rotation)
+        origins = np.broadcast_to(camera_centres(camera_from_head), directions.shape)
+        face, bary, _ = self._scene.intersect(origins, directions @ camera_from_head[:3, :3])
         index = np.nonzero(face >= 0)[0]
         face, bary = face[index], bary[index].astype(np.float64)
         uv = interpolate(self._mesh.uvs, self._mesh.face_uvs, face, bary)

@@ -66,6 +66,11 @@ def pose_errors_own_alignment(truth: np.ndarray, result: np.ndarray) -> dict:
     }
 
 
+def albedo_differences(truth: np.ndarray, result: np.ndarray) -> np.ndarray:
+    """[N,3] linear albedo pairs -> dE2000 [N]; what is negative counts as black."""
+    return delta_e_2000(np.clip(truth, 0, None), np.clip(result, 0, None))
+
+
 def albedo_errors(truth: np.ndarray, result: np.ndarray, rng: np.random.Generator) -> dict:
     """[N,3] linear albedo pairs -> PSNR, RMSE and median dE2000, with three, one and no gain removed."""
     truth, result = truth.astype(np.float64), result.astype(np.float64)
@@ -74,7 +79,7 @@ def albedo_errors(truth: np.ndarray, result: np.ndarray, rng: np.random.Generato
     subset = rng.choice(len(truth), min(len(truth), DELTA_E_SAMPLES), replace=False)
     scores: dict = {}
     for name, value in (("aligned", result * gain), ("aligned_one_gain", result * common), ("raw", result)):
-        difference = delta_e_2000(np.clip(truth[subset], 0, None), np.clip(value[subset], 0, None))
+        difference = albedo_differences(truth[subset], value[subset])
         scores[name] = {
             "psnr_linear": psnr(truth, value),
             "psnr_srgb": psnr(srgb(truth), srgb(value)),

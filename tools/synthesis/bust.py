@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.geometry.mesh import Mesh, normalised
+from shared.geometry.mesh import Mesh, boundary_loop, half_edges, normalised
 
 UV_SCALE, UV_STRIP = 0.92, 0.075
 """The head's layout shrinks to this share of the texture; the shoulders take a strip along the lower border."""
@@ -16,7 +16,7 @@ SHOULDER_Y_MM, BOTTOM_Y_MM, SPINE_Z_MM = -192.0, -420.0, -38.0
 
 def with_bust(head: Mesh) -> Mesh:
     """The head with a bust below its rim. New vertices and faces follow the old ones; uvs move, see UV_SCALE."""
-    rim = _ordered_rim(head)
+    rim = boundary_loop(head.faces)
     count, columns = len(head.vertices), len(rim)
     rings = _bust_rings(head.vertices[rim], _outward_tangents(head, rim))
     index = np.concatenate([rim[None], count + np.arange((RINGS - 1) * columns).reshape(RINGS - 1, columns)])
@@ -33,20 +33,9 @@ def with_bust(head: Mesh) -> Mesh:
     )
 
 
-def _ordered_rim(head: Mesh) -> np.ndarray:
-    """Vertices along the open border, in the direction in which a neighbour below would run."""
-    edges = np.concatenate([head.faces[:, [0, 1]], head.faces[:, [1, 2]], head.faces[:, [2, 0]]])
-    _, inverse, shared = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    following = dict(edges[shared[inverse.ravel()] == 1].tolist())
-    loop = [min(following)]
-    while following[loop[-1]] != loop[0]:
-        loop.append(following[loop[-1]])
-    return np.array(loop)
-
-
 def _outward_tangents(head: Mesh, rim: np.ndarray) -> np.ndarray:
     """[C, 3] unit directions in which the surface would go on beyond its rim, smoothed along it."""
-    edges = np.concatenate([head.faces[:, [0, 1]], head.faces[:, [1, 2]], head.faces[:, [2, 0]]])
+    edges = half_edges(head.faces)
     edges = np.concatenate([edges, edges[:, ::-1]])
     tangents = np.zeros((len(rim), 3))
     for i, vertex in enumerate(rim):

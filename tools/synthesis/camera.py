@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shared.geometry.mesh import normalised
-from shared.geometry.transforms import project
+from shared.geometry.transforms import camera_centres, project
 from shared.imaging.texture import sample_bilinear
 from shared.rendering.envmap import latlong_lookup
 from tools.synthesis.highlights import SAMPLE_SETS, GlossSamples, glossy_radiance
@@ -109,9 +109,8 @@ def _background(light: EnvironmentLight, shot: SyntheticShot, camera: PinholeCam
 def _primary_hits(surface: SyntheticSurface, shot: SyntheticShot, camera: PinholeCamera,
                   points_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Rays through image points [N, 2]: which hit [M], their head-space directions [M, 3] and what lies there."""
-    rotation, translation = shot.camera_from_head[:3, :3], shot.camera_from_head[:3, 3]
-    directions = (_camera_directions(points_px, camera) @ rotation).astype(np.float32)
-    origins = np.broadcast_to(-translation @ rotation, directions.shape)
+    directions = (_camera_directions(points_px, camera) @ shot.camera_from_head[:3, :3]).astype(np.float32)
+    origins = np.broadcast_to(camera_centres(shot.camera_from_head), directions.shape)
     face, bary, depth = surface.scene.intersect(origins, directions)
     hit = np.nonzero(face >= 0)[0]
     points = surface.points(face[hit], bary[hit])

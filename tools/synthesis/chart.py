@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates
 
 from shared.capture.chart import COLUMNS, CORNERS, PATCHES, ROWS, reflectances
 from shared.geometry.raycast import RayScene
-from shared.geometry.transforms import fibonacci_sphere, project, rigid, rotation_from_vector
+from shared.geometry.transforms import camera_centres, fibonacci_sphere, project, rigid, rotation_from_vector
 from shared.imaging.texture import sample_bilinear
 from tools.synthesis.irradiance import SyntheticShot
 from tools.synthesis.light import EnvironmentLight
@@ -86,9 +86,9 @@ def _shade(chart: PlacedChart, head: RayScene, white: np.ndarray, shot: Syntheti
     depth = (origin @ normal) / (rays @ normal)
     grid = ((rays * depth[:, None] - origin) @ rotation)[:, :2] / PITCH_MM + [COLUMNS / 2, ROWS / 2]
     covered = ((grid > -BORDER) & (grid < np.array([COLUMNS, ROWS]) + BORDER)).all(1)
-    turn, shift = shot.camera_from_head[:3, :3], shot.camera_from_head[:3, 3]
-    directions = (rays[covered] @ turn).astype(np.float32)
-    _, _, distance = head.intersect(np.broadcast_to(-shift @ turn, directions.shape), directions)
+    directions = (rays[covered] @ shot.camera_from_head[:3, :3]).astype(np.float32)
+    origins = np.broadcast_to(camera_centres(shot.camera_from_head), directions.shape)
+    _, _, distance = head.intersect(origins, directions)
     covered[covered] = ~(distance < depth[covered])
     cell = np.floor(grid).astype(int)
     in_patch = covered & (np.abs(grid - cell - 0.5) < 0.5 - GAP / 2).all(1)

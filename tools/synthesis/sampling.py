@@ -50,9 +50,3 @@ def visible_ggx_normal(outgoing: np.ndarray, alpha: np.ndarray, points: np.ndarr
     half = np.stack([ring * np.cos(phi), ring * np.sin(phi), z], -1) + stretched
     half *= np.stack([alpha, alpha, np.ones_like(alpha)], -1)
     return half / np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-12)
-
-
-def cosine_direction(points: np.ndarray) -> np.ndarray:
-    """Points [N, 2] of the unit square -> directions [N, 3] about +z with density cos / pi."""
-    radius, phi = np.sqrt(points[..., 0]), 2 * np.pi * points[..., 1]
-    return np.stack([radius * np.cos(phi), radius * np.sin(phi), np.sqrt(1.0 - points[..., 0])], -1)

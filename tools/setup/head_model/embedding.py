@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shared.capture.landmarks import LANDMARK_COUNT, OVAL, FaceNetworks
-from shared.compute.robust import ROBUST_SCALE
+from shared.compute.robust import ROBUST_SCALE, cauchy_weight
 from shared.geometry.mesh import interpolate, normalised, vertex_normals
 from shared.geometry.raycast import RayScene, camera_hits
 from shared.geometry.transforms import rigid, rotation_from_vector
@@ -41,15 +41,11 @@ SEED = 468
 
 @dataclass(frozen=True)
 class Embedding:
-    """face [468], bary [468, 3], weight [468] as in HeadModel; spread_mm [468]; scores of the renderings [N,
-    2].
-    """
+    """face [468], bary [468, 3], weight [468] as in HeadModel."""
 
     face: np.ndarray
     bary: np.ndarray
     weight: np.ndarray
-    spread_mm: np.ndarray
-    scores: np.ndarray
 
 
 def embed_landmarks(model: HeadModel, topology: HeadTopology, networks: FaceNetworks) -> Embedding:
@@ -57,13 +53,11 @@ def embed_landmarks(model: HeadModel, topology: HeadTopology, networks: FaceNetw
     fine = model.subdivided().subdivided()
     colour = _colours(fine, topology, model.template)
     rng = np.random.default_rng(SEED)
-    places, scores = [], []
+    places = []
     for yaw, pitch in product(YAWS_DEG, PITCHES_DEG):
         for light in LIGHTS:
             vertices = fine.shape(rng.normal(0, IDENTITY_DEVIATION, len(fine.identity_basis)))
-            place, score = _landmarks_on_surface(fine, vertices, colour, networks, np.radians([pitch, yaw]), light)
-            places.append(place)
-            scores.append(score)
+            places.append(_landmarks_on_surface(fine, vertices, colour, networks, np.radians([pitch, yaw]), light))
     places = np.stack(places)
     middle = np.nanmedian(places, axis=0)
     spread = ROBUST_SCALE * np.nanmedian(np.linalg.norm(places - middle, axis=2), axis=0)
@@ -71,10 +65,10 @@ def embed_landmarks(model: HeadModel, topology: HeadTopology, networks: FaceNetw
     face, bary = _closest(fine, np.repeat(topology.part == SKIN, 16), middle)
     for _ in range(2):
         face, bary = parent_location(face, bary)
-    weight = 1 / (1 + (spread / SPREAD_MM) ** 2)
+    weight = cauchy_weight(spread, SPREAD_MM)
     weight[list(OVAL)] = 0
     weight[spread > MAX_SPREAD_MM] = 0
-    return Embedding(face, bary, weight, spread, np.array(scores))
+    return Embedding(face, bary, weight)
 
 
 def render_head(
@@ -124,23 +118,21 @@ def _landmarks_on_surface(
     networks: FaceNetworks,
     pitch_yaw: np.ndarray,
     light: tuple[float, float, float],
-) -> tuple[np.ndarray, tuple]:
-    """Where one rendering's landmarks fall: places [468, 3] on the template (NaN: beside the head), and
-    scores.
-    """
+) -> np.ndarray:
+    """Where one rendering's landmarks fall: places [468, 3] on the template (NaN: beside the head)."""
     rotation = rotation_from_vector(np.array([pitch_yaw[0], 0, 0])) @ rotation_from_vector(
         np.array([0, pitch_yaw[1], 0])
     )
     picture, face, bary = render_head(vertices, fine.faces, colour, rotation, light)
     found = networks.detect(picture)
     if not found:
-        return np.full((LANDMARK_COUNT, 3), np.nan), (0.0, 0.0)
-    presence, points = networks.landmarks(picture, found[0])
+        return np.full((LANDMARK_COUNT, 3), np.nan)
+    _, points = networks.landmarks(picture, found[0])
     column, row = np.clip(np.floor(points[:, :2]).astype(int), 0, RENDER_SIZE - 1).T
     face, bary = face[row, column], bary[row, column]
     place = interpolate(fine.template, fine.faces, face, bary)
     place[face < 0] = np.nan
-    return place, (found[0].score, presence)
+    return place
 
 
 def mirror_partners(places: np.ndarray) -> np.ndarray:

@@ -9,12 +9,12 @@ eyeballs lie in a strip below.
 """
 
 import numpy as np
-import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
+from shared.geometry.mesh import boundary_loop, graph_laplacian, vertex_adjacency
 from tools.setup.head_model.relaxation import relax
 from tools.setup.head_model.segments import SEGMENT_NAMES
-from tools.setup.head_model.topology import EYE_LEFT, EYE_RIGHT, HeadTopology, boundary_loop, triangle_adjacency
+from tools.setup.head_model.topology import EYE_LEFT, EYE_RIGHT, HeadTopology
 
 MARGIN = 4 / 1024
 STRIP = 0.078
@@ -60,7 +60,7 @@ def _cut_path(template: np.ndarray, topology: HeadTopology, segment: np.ndarray)
     """Vertices of the cut along the middle line, from behind the hairline over the crown to the rim at the
     nape.
     """
-    adjacency = triangle_adjacency(topology.faces, len(template))
+    adjacency = vertex_adjacency(topology.faces, len(template))
     forehead = np.unique(topology.faces[segment == SEGMENT_NAMES.index("forehead")])
     hairline = template[forehead, 1].max()
     allowed = np.isin(
@@ -137,8 +137,7 @@ def _harmonic(vertices: np.ndarray, faces: np.ndarray, sides: list[np.ndarray]) 
         along = np.concatenate([[0], np.cumsum(steps)]) / steps.sum()
         position[side] = corners[k] + along[:, None] * (corners[(k + 1) % 4] - corners[k])
         on_rim[side] = True
-    adjacency = triangle_adjacency(faces, len(vertices))
-    laplacian = (sparse.diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency).tocsr()
+    laplacian = graph_laplacian(faces, len(vertices))
     inner = np.nonzero(~on_rim)[0]
     right_hand = -(laplacian[inner][:, on_rim] @ position[on_rim])
     position[inner] = splu(laplacian[inner][:, inner].tocsc()).solve(right_hand)

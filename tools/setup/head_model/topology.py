@@ -72,26 +72,6 @@ def rings_around(topology: HeadTopology, parts: tuple[int, ...], count: int) -> 
     return np.repeat(ring, 2)
 
 
-def triangle_adjacency(faces: np.ndarray, vertex_count: int) -> sparse.csr_matrix:
-    """[V, V] symmetric 0/1 adjacency of a triangle mesh."""
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    matrix = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count,) * 2)
-    return ((matrix + matrix.T) > 0).astype(np.float64).tocsr()
-
-
-def boundary_loop(faces: np.ndarray) -> np.ndarray:
-    """The vertices along the rim of a surface with one boundary, in the order of its faces' orientation."""
-    half_edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    twins = {(int(b), int(a)) for a, b in half_edges}
-    following = {int(a): int(b) for a, b in half_edges if (int(a), int(b)) not in twins}
-    loop = [min(following)]
-    while following[loop[-1]] != loop[0]:
-        loop.append(following[loop[-1]])
-    if len(loop) != len(following):
-        raise ValueError(f"the surface has more than one boundary: {len(loop)} of {len(following)} edges in a loop")
-    return np.array(loop)
-
-
 def _head_quads(base: BaseMesh) -> tuple[np.ndarray, np.ndarray]:
     """Quads [Q, 4] and parts [Q]. The texture islands of the body tell its parts apart."""
     quads, uvs = base.quads["body"], base.quad_uvs["body"]

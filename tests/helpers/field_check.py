@@ -1,14 +1,12 @@
-"""What a JSON or NPZ file holds, entry by entry: declared once, listed in docs/files.md, compared with real files.
-
-The path of a field names the keys that lead to it: `crop.scale`; `frames[].file` of every item of a list;
-`segments.<segment>.albedo` where the key itself varies. `parameters.**` is `parameters` with everything below it.
-"""
+"""Compares what a JSON or NPZ file holds with its declared fields, entry by entry."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+
+from shared.contract.declare import Field
 
 ITEM, ANY_KEY, ALL_BELOW = "[]", "<", ".**"
 KINDS = {"number": (int, float), "int": (int,), "text": (str,), "bool": (bool,),
@@ -17,25 +15,9 @@ KINDS = {"number": (int, float), "int": (int,), "text": (str,), "bool": (bool,),
 _PART = re.compile(r"\[\]|[^.\[\]]+")
 
 
-@dataclass(frozen=True)
-class Field:
-    """One entry of a file.
-
-    kind: of KINDS, or an array's type; '' for an entry that only holds others. shape: of arrays and lists, numbers and
-    letters separated by commas. unit: '' for counts, ratios and names. optional: may be absent, with all below it.
-    """
-
-    path: str
-    help: str
-    kind: str = "number"
-    shape: str = ""
-    unit: str = ""
-    optional: bool = False
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """The path, key by key."""
-        return tuple(_PART.findall(self.path.removesuffix(ALL_BELOW)))
+def parts_of(field: Field) -> tuple[str, ...]:
+    """A field's path, key by key."""
+    return tuple(_PART.findall(field.path.removesuffix(ALL_BELOW)))
 
 
 def below(fields: Iterable[Field], path: str) -> tuple[Field, ...]:
@@ -58,7 +40,7 @@ def field_faults(content: Mapping[str, object], fields: Sequence[Field]) -> list
 
 def written_fields(content: Mapping[str, object], fields: Sequence[Field]) -> set[str]:
     """Paths of the declared fields that the content holds; lists and mappings without entries hold none of theirs."""
-    return {field.path for field in fields if any(True for _ in _values(content, field.parts))}
+    return {field.path for field in fields if any(True for _ in _values(content, parts_of(field)))}
 
 
 class _Node(dict):
@@ -71,7 +53,7 @@ def _tree(fields: Sequence[Field]) -> _Node:
     root = _Node()
     for field in fields:
         node = root
-        for part in field.parts:
+        for part in parts_of(field):
             node = node.setdefault(part, _Node())
         if node.field is not None:
             raise ValueError(f"{field.path} is declared twice")
