@@ -1,5 +1,5 @@
 """Mitsuba 3's gradient-based inverse rendering of a tracked clip: the peer in the chart of
-tools/bench/chart/command.py.
+tools/bench/chart/bench.py.
 
     python -m tools.bench.peers.inverse SUBJECT RUN OUT --at 60 120
 
