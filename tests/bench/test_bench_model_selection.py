@@ -9,7 +9,7 @@ from tools.bench.model_selection import CANDIDATES, compare
 def row(clip, candidate, mesh, error, seconds):
     return {"clip": clip, "rung": candidate, "mesh": mesh, "held_out": 1.2 * error, "held_out_abs": error,
             "cpu_s": seconds,
-            "light": "cubemap 8", "visibility": "bounces", "specular": True, "chosen": ""}
+            "light": "cubemap 8", "chosen": ""}
 
 
 TABLE = [row("a", "auto", "tracked", 0.0103, 12.0), row("a", "least", "tracked", 0.02, 5.0),

@@ -16,7 +16,7 @@ SMALL = "points=400 directions=128 bounce_nodes=100 light_resolution=4 shape_sub
 
 def test_known_errors_of_shape_are_found(tiny_run):
     clip = open_clip(TINY, tiny_run, False)
-    mesh = clip.mesh
+    mesh = clip.surface.mesh
     right = shape_errors(TINY, clip, mesh)
     assert right["distance_median_mm"] < 0.02 and right["normal_median_deg"] < 0.6
     ripple = 0.5 * np.sign(np.sin(mesh.vertices[:, :1] / 3)) * vertex_normals(mesh.vertices, mesh.faces)
@@ -42,7 +42,7 @@ def test_a_row_for_each_lambda_beside_the_tracked_and_the_exported_mesh(tiny_run
 def test_profiles_of_one_mesh_coincide(tiny_run):
     """The exported mesh's place taken by the truth: both pictures alike, and its red outline over the black one."""
     clip = open_clip(TINY, tiny_run, False)
-    truth, mesh, outlines, *_ = np.split(profile_picture(TINY, clip, clip.mesh, 160), 5, axis=1)
+    truth, mesh, outlines, *_ = np.split(profile_picture(TINY, clip, clip.surface.mesh, 160), 5, axis=1)
     assert np.mean(np.abs(truth.astype(int) - mesh) > 8) < 0.02 and len(np.unique(truth)) > 50
     red = (outlines == [255, 0, 0]).all(2)
     assert 100 < red.sum() < 2000 and (outlines == 0).all(2).sum() < 0.1 * red.sum()

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,6 @@ from shared.inverse.parameters import read_settings
 from shared.inverse.problem import InverseSettings
 from stages.inverse_render import STAGE
 from tools.bench.runner import Bench
-
-
-def silent(items: Iterable, label: str = "", total: int | None = None) -> Iterable:
-    """Progress that shows nothing."""
-    return items
 
 
 def settings_of(changes: Mapping[str, Any]) -> InverseSettings:

@@ -4,7 +4,7 @@
 
 RUN: a run's folder whose work/ holds sample_frames and track_landmarks. Light and mesh are solved with model=auto and
 with each fixed model, without the outline and the texture pass, which all share. Every fixed model counts twice, with
-the tracked mesh and with the refined one. At the end, for each clip: model selection's error and seconds relative to
+the tracked mesh and with a refined one. At the end, for each clip: model selection's error and seconds relative to
 those of the fixed candidate with the least error (mean absolute, by which model selection chooses; beside it the root
 mean square relative to the least one).
 
@@ -15,20 +15,20 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
 import numpy as np
-from shared.inverse.light_and_mesh import solve_light
 
-from shared.appearance.fit import Solution
+from shared.compute.run_context import RunContext
 from shared.geometry.transforms import fibonacci_sphere
-from shared.imaging.image_sampling import SurfaceViewer
 from shared.inverse.clip_inputs import ClipInputs, read_inputs
-from shared.inverse.problem import frames_to_fit
+from shared.inverse.problem import some_views
+from shared.inverse.solve import describe_light, solve_clip
 from shared.rendering.lobes import SpecularTransfer
 from shared.rendering.specular_transfer import specular_tables
-from tools.bench.clips import SettingsBench, settings_of, silent
+from tools.bench.clips import SettingsBench, settings_of
 from tools.bench.runner import Clock, Entry, Table
 
 LEAST = {"visibility": False, "specular": False, "light_model": "harmonics_2"}
@@ -46,7 +46,9 @@ CANDIDATES: dict[str, dict] = {
     "cubemap_16_no_visibility": {"light_resolution": 16, "visibility": False},
     "cubemap_32": {"light_resolution": 32},
 }
-COLUMNS = ("clip", "rung", "mesh", "held_out", "held_out_abs", "cpu_s", "light", "visibility", "specular", "chosen")
+SMALLEST = {"map_size": 64, "normal_map": False, "local_roughness": False}
+"""Model selection ends before the maps; they are as small as they can be."""
+COLUMNS = ("clip", "rung", "mesh", "held_out", "held_out_abs", "cpu_s", "light", "chosen")
 
 
 def compile_loops() -> None:
@@ -57,41 +59,34 @@ def compile_loops() -> None:
     specular_tables(table, up[:, None], np.array([0.5]))
 
 
-def measure(inputs: ClipInputs, clip: str, candidate: str, given: dict) -> list[dict]:
-    """The table's rows of one candidate on one clip: of a fixed one with the tracked mesh and with the refined one."""
-    settings, clock, marks = settings_of({**given, **CANDIDATES[candidate]}), Clock(), []
+def measure(inputs: ClipInputs, candidate: str, refine: bool, given: dict) -> dict:
+    """Of one candidate on one clip: what was chosen, errors on held-out frames, CPU seconds up to the texture pass.
 
-    def progress(items, label: str = ""):
-        """Notes when the mesh's turn has come."""
-        if label.startswith("shape"):
-            marks.append(clock.cpu_s)
+    held_out, held_out_abs: root mean square and mean absolute residual.
+    """
+    settings = settings_of({**given, **SMALLEST, **CANDIDATES[candidate], "shape": refine})
+    if settings.shape is not None:
+        settings = replace(settings, shape=replace(settings.shape, contour=None))
+    clock, marks = Clock(), {}
+
+    def progress(items, label: str):
+        """Notes when the texture's turn has come."""
+        marks.setdefault(label, clock.cpu_s)
         return items
 
-    viewer = SurfaceViewer.of(inputs.mesh)
-    fitted = frames_to_fit(inputs, settings, viewer)
-    lit = solve_light(inputs, settings, viewer, fitted, None, progress, print if candidate == "auto" else silent)
-    seconds, appearance, shape = clock.cpu_s, lit.settings.appearance, lit.shape_record
-    facts = {
-        "clip": clip,
-        "rung": candidate,
-        "light": f"{appearance.light_model} {appearance.resolutions[-1]}",
-        "visibility": "bounces" if appearance.bounce and appearance.visibility else appearance.visibility,
-        "specular": appearance.specular,
+    context = RunContext(progress, print if candidate == "auto" else lambda text: None)
+    result = solve_clip(inputs.views, inputs.surface, settings, context)
+    solution = result.solution
+    judged = ~some_views(inputs.views.with_fitted(result.fitted), settings, settings.light_frames).fitted
+    climbed = [row for row in result.record["rungs"] if row["climbed"]]
+    return {
+        "mesh": "refined" if refine else "tracked",
+        "held_out": solution.held_out,
+        "held_out_abs": float(solution.frame_errors[judged].mean()),
+        "cpu_s": marks["tracing the surface"],
+        "light": describe_light(solution.state),
+        "chosen": " > ".join(f"{row['part']} {row['rung']}" for row in climbed),
     }
-    judged = ~lit.capture.fitted
-    if candidate == "auto":
-        facts["chosen"] = " > ".join(f"{row['part']} {row['rung']}" for row in lit.candidates if row["climbed"])
-    rows = [{**facts, "mesh": "refined" if shape["refined"] else "tracked", **errors_of(lit.solution, judged),
-             "cpu_s": seconds}]
-    if lit.tracked is not None:
-        rows[0]["mesh"] = "refined"  # or what was tried in vain: that, too, is what this candidate costs
-        rows.insert(0, {**facts, "mesh": "tracked", **errors_of(lit.tracked, judged), "cpu_s": marks[0]})
-    return rows
-
-
-def errors_of(solution: Solution, judged: np.ndarray) -> dict:
-    """Root mean square and mean absolute residual on held-out frames, judged [F] bool."""
-    return {"held_out": solution.held_out, "held_out_abs": float(solution.frame_errors[judged].mean())}
 
 
 def compare(rows: Sequence[dict]) -> list[dict]:
@@ -106,7 +101,7 @@ def compare(rows: Sequence[dict]) -> list[dict]:
             result.append({
                 "clip": clip,
                 "best_fixed": f"{best['rung']}, {best['mesh']}",
-                "auto": ", ".join(f"{key} {auto[key]}" for key in ("light", "visibility", "specular", "mesh")),
+                "auto": ", ".join(f"{key} {auto[key]}" for key in ("light", "chosen")),
                 "error_ratio": auto["held_out_abs"] / best["held_out_abs"],
                 "square_ratio": auto["held_out"] / least_square,
                 "time_ratio": auto["cpu_s"] / best["cpu_s"],
@@ -124,15 +119,16 @@ class ModelSelectionBench(SettingsBench):
         super().add_arguments(parser)
         parser.add_argument("runs", nargs="*", type=Path, help="runs' folders, with work/")
 
-    def cases(self) -> dict[str, tuple[Path, str]]:
-        return {f"{run.resolve().name}: {candidate}": (run, candidate)
-                for run in self.options.runs for candidate in CANDIDATES}
+    def cases(self) -> dict[str, tuple[Path, str, bool]]:
+        return {f"{run.resolve().name}: {candidate}, {'refined' if refine else 'tracked'}": (run, candidate, refine)
+                for run in self.options.runs for candidate in CANDIDATES for refine in (False, True)
+                if refine or candidate != "auto"}
 
-    def measure(self, case: tuple[Path, str], entry: Entry) -> None:
-        run, candidate = case
+    def measure(self, case: tuple[Path, str, bool], entry: Entry) -> None:
+        run, candidate, refine = case
         compile_loops()
         inputs = read_inputs(run / "work" / "sample_frames", run / "work" / "track_landmarks")
-        entry.add(*measure(inputs, run.resolve().name, candidate, self.given))
+        entry.add({"clip": run.resolve().name, "rung": candidate, **measure(inputs, candidate, refine, self.given)})
 
     def conclude(self, table: Table) -> int:
         compared = compare(table.rows)

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from shared.compute.run_context import RunContext
 from shared.contract.pipeline import load_pipeline
 from shared.geometry.mesh import Mesh
 from shared.imaging.image_sampling import SurfaceViewer
@@ -141,7 +142,7 @@ class _Scored:
             self.add({"seconds": seconds, "iteration": solver.iteration} | self.score(mesh, maps))
         self.next = SCORED_GROWTH * solver.iteration
 
-    def progress(self, items: Iterable, label: str = "", total: int | None = None) -> Iterable:
+    def progress(self, items: Iterable, label: str) -> Iterable:
         """Ends the iterations when the minutes are over, right after a checkpoint."""
         for i, item in enumerate(items):
             yield item
@@ -151,10 +152,10 @@ class _Scored:
                     raise _Enough
 
 
-def _transfer_row(subject: Path, inputs: ClipInputs, changes: dict) -> dict:
+def _transfer_row(subject: Path, run: Path, tracked: bool, changes: dict) -> dict:
     """Seconds, steps and errors of one solve."""
-    clock = Clock()
-    result = solve_clip(inputs, settings_of(changes), lambda items, label="": items, print)
+    inputs, clock = open_clip(subject, run, tracked), Clock()
+    result = solve_clip(inputs.views, inputs.surface, settings_of(changes), RunContext(note=print))
     found = {"seconds": clock.cpu_s, "iteration": len(result.solution.iterations)}
     return found | map_errors(subject, inputs, inputs.frame_index, result.viewer.mesh, result.maps)
 
@@ -178,8 +179,7 @@ class PublishedBench(ClipBench):
         return bool(case.size) and super().done(name, case, repeat, table)
 
     def measure(self, case: SolverCase, entry: Entry) -> None:
-        true = case.true_shape and self.tracked
-        inputs = open_clip(self.options.subject, self.options.run, tracked=False) if true else self.clip
+        subject, run, tracked = self.options.subject, self.options.run, self.tracked and not case.true_shape
         words = {"label": case.label, "solver": case.solver, "size": case.size}
 
         def add_row(row: dict) -> None:
@@ -189,10 +189,11 @@ class PublishedBench(ClipBench):
         if case.size:
             # What a process does but once, it does for each row: the loops' compilation counts.
             with ProcessPoolExecutor(1, get_context("spawn")) as alone:
-                task = alone.submit(_transfer_row, self.options.subject, inputs, TRANSFER_SIZES[case.size] | changes)
+                task = alone.submit(_transfer_row, subject, run, tracked, TRANSFER_SIZES[case.size] | changes)
                 add_row(task.result())
         else:
-            self._solve_reference(f"{self.name}_{case.label}_{entry.repeat}", inputs, changes, add_row, entry.known)
+            label, clip = f"{self.name}_{case.label}_{entry.repeat}", open_clip(subject, run, tracked)
+            self._solve_reference(label, clip, changes, add_row, entry.known)
 
     def _solve_reference(
         self, label: str, inputs: ClipInputs, changes: dict, add: Callable[[dict], None], before: Sequence[dict]
@@ -208,9 +209,10 @@ class PublishedBench(ClipBench):
         scored = _Scored(score, add, before, self.options.out / f"{label}.seconds", self.options.reference_minutes)
         if scored.over:
             return
-        fitted = frames_to_fit(inputs, settings, SurfaceViewer.of(inputs.mesh))
+        fitted = frames_to_fit(inputs.views, inputs.surface, settings, SurfaceViewer.of(inputs.surface.mesh))
+        views, context = inputs.views.with_fitted(fitted), RunContext(scored.progress, print)
         try:
-            solve_by_reference(inputs, settings, reference, fitted, scored.progress, print, scored.observe)
+            solve_by_reference(views, inputs.surface, settings, reference, context, scored.observe)
         except _Enough:
             print(f"{scored.seconds():.0f} s so far; more --reference-minutes to go on")
 

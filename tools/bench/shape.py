@@ -29,7 +29,7 @@ from shared.io.arrays import load_arrays
 from shared.io.images import write_png
 from shared.io.meshes import read_obj
 from shared.report.shape_pictures import shaded_picture, turned_camera
-from tools.bench.clips import ClipBench, settings_of, silent
+from tools.bench.clips import ClipBench, settings_of
 from tools.bench.runner import Clock, Entry
 from tools.scoring.score import ScoredResult, camera_intrinsics, score_appearance, score_geometry, scored_frames
 
@@ -44,7 +44,7 @@ def shape_errors(subject: Path, clip: ClipInputs, mesh: Mesh) -> dict[str, float
     """Distances in mm and angles in degrees of a mesh in the clip's head space to the true face."""
     gt_frames = load_arrays(subject / "gt" / "poses.npz")["gt_frames"]
     alignment, distance = _aligned(subject, clip, mesh)
-    poses = dict(zip(clip.frame_index.tolist(), clip.camera_from_head, strict=True))
+    poses = dict(zip(clip.frame_index.tolist(), clip.views.camera_from_head, strict=True))
     result = ScoredResult(subject, mesh, {}, poses, camera_intrinsics(subject))
     rng = np.random.default_rng(0)
     normals = score_appearance(subject, result, scored_frames(gt_frames, result), alignment.rotation, rng)["normal_deg"]
@@ -61,7 +61,7 @@ def _aligned(subject: Path, clip: ClipInputs, mesh: Mesh) -> tuple[Similarity, d
     """truth_from_head of the mesh, and a summary of its distances in mm."""
     poses = load_arrays(subject / "gt" / "poses.npz")["camera_from_head"][clip.frame_index]
     rng = np.random.default_rng(0)
-    alignment, scores = score_geometry(subject, mesh, poses, clip.camera_from_head, rng)
+    alignment, scores = score_geometry(subject, mesh, poses, clip.views.camera_from_head, rng)
     return alignment, scores["geometry_mm"]
 
 
@@ -69,7 +69,7 @@ def profile_picture(subject: Path, clip: ClipInputs, mesh: Mesh, size: int = 480
     """uint8 [size, 5 size, 3]: truth and mesh in profile, the outlines, truth and mesh from three quarters."""
     truth = read_obj(subject / "gt" / "mesh.obj")
     alignment, _ = _aligned(subject, clip, mesh)
-    tracked, placed = (own.replace(vertices=alignment.points(own.vertices)) for own in (clip.mesh, mesh))
+    tracked, placed = (own.replace(vertices=alignment.points(own.vertices)) for own in (clip.surface.mesh, mesh))
     tip = truth.vertices[np.argmax(truth.vertices[:, 2])]
     view = tip - [0.0, 5.0, 25.0], PROFILE_MM, size
     drawn = [shaded_picture(own, np.radians(yaw), *view) for yaw in (-90.0, -40.0) for own in (truth, placed)]
@@ -102,7 +102,7 @@ class ShapeBench(ClipBench):
     def measure(self, case: float | None, entry: Entry) -> None:
         subject, clip = self.options.subject, self.clip
         if entry.name == TRACKED:
-            entry.add({"smoothness": entry.name, **shape_errors(subject, clip, clip.mesh)})
+            entry.add({"smoothness": entry.name, **shape_errors(subject, clip, clip.surface.mesh)})
         elif entry.name == EXPORTED:
             mesh = read_obj(self.options.run / "export" / "mesh.obj")
             entry.add({"smoothness": entry.name, **shape_errors(subject, clip, mesh)})
@@ -114,7 +114,7 @@ class ShapeBench(ClipBench):
         """A row of the table: the clip solved with that lambda, maps as small as they can be."""
         small = {"map_size": 64, "normal_map": False}
         settings, clock = settings_of({**small, **self.given, "shape_smoothness": smoothness}), Clock()
-        result = solve_clip(self.clip, settings, silent, lambda text: None)
+        result = solve_clip(self.clip.views, self.clip.surface, settings)
         found = {"smoothness": smoothness, "seconds": clock.wall_s, "held_out_residual": result.solution.held_out,
                  "stopped": result.record["shape"]["stopped_vertices"]}
         return found | shape_errors(self.options.subject, self.clip, result.viewer.mesh)
