@@ -55,7 +55,7 @@ chart: setup
 	$(BIN)/python -m tools.bench.chart $(SUBJECT) --cases $(CASES) --out $(OUT)
 
 stress: setup
-	$(BIN)/python -m tools.bench.stress build/stress
+	$(BIN)/python -m tools.bench.stress
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -41,9 +41,15 @@ MAY_IMPORT = {
     "tools.demo": "tools.limn tools.synthesis tools.scoring",
     "tools.relight": "shared",
     "tools.bench.peers": "shared tools.scoring",
-    "tools.bench.chart": "shared tools.synthesis tools.scoring tools.demo tools.relight",
-    "tools.bench.stress": "shared tools.cli tools.synthesis tools.scoring",
-    "tools.bench": "shared stages tools.synthesis tools.scoring tools.bench.peers tools.bench.chart",
+    "tools.bench.runner": "shared",
+    "tools.bench.drawing": "shared",
+    "tools.bench.chart":
+        "shared tools.synthesis tools.scoring tools.demo tools.relight tools.bench.runner tools.bench.drawing",
+    "tools.bench.stress":
+        "shared tools.cli tools.synthesis tools.scoring tools.bench.runner tools.bench.drawing",
+    "tools.bench":
+        "shared stages tools.synthesis tools.scoring tools.bench.runner tools.bench.drawing tools.bench.peers "
+        "tools.bench.chart tools.bench.stress",
     "tools.setup.head_model": "shared",
     "tools.setup": "shared tools.bench.peers tools.setup.head_model",
     "tools.documents": "shared tools.bench.chart",

@@ -5,7 +5,7 @@ import pytest
 
 from shared.errors import InputError
 from shared.tracking.models import load_head_model
-from tools.bench.colour_chart import main, measure
+from tools.bench.colour_chart import measure, summary
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -24,7 +24,9 @@ def test_charts_in_an_even_light_miss_nothing():
     assert np.abs(error - error.mean(1, keepdims=True)).max() < 0.02
 
 
-def test_the_table_has_a_row_per_light(capsys):
-    assert main(["--lights", "room", "--places", "1"]) == 0
-    head, row = capsys.readouterr().out.splitlines()
-    assert head.split()[:3] == ["light", "used", "median"] and row.split()[0] == "room"
+def test_a_light_is_summed_up():
+    found = np.array([[[0.1, 0.1, 0.1], [0.1] * 3], [[-0.3, -0.3, -0.3], [0.3] * 3]])
+    row = summary(found)
+    assert row["used"] == 2 and row["median"] == pytest.approx(0.2) and row["rms"] == pytest.approx(0.05**0.5)
+    assert row["rms_over_stated"] == pytest.approx(1.0) and row["ratios"] == pytest.approx(0.0, abs=1e-12)
+    assert np.isnan(summary(np.zeros((0, 2, 3)))["rms"])

@@ -1,15 +1,15 @@
-"""The benchmark of model selection: what it compares, and that an interrupted table goes on."""
+"""The benchmark of model selection: what it compares."""
 
 import pytest
 
-from tools.bench import model_selection
-from tools.bench.model_selection import compare, main, read_rows, write_rows
+from tools.bench.clips import settings_of
+from tools.bench.model_selection import CANDIDATES, compare
 
 
 def row(clip, candidate, mesh, error, seconds):
     return {"clip": clip, "rung": candidate, "mesh": mesh, "held_out": 1.2 * error, "held_out_abs": error,
             "cpu_s": seconds,
-            "light": "cubemap 8", "visibility": "bounces", "specular": True, "chosen": ""}
+            "light": "cubemap 8", "chosen": ""}
 
 
 TABLE = [row("a", "auto", "tracked", 0.0103, 12.0), row("a", "least", "tracked", 0.02, 5.0),
@@ -24,21 +24,7 @@ def test_model_selection_is_compared_with_the_best_fixed_candidate():
     assert compare(TABLE[:1]) == []  # nothing to compare with
 
 
-def test_rows_survive_the_table_and_are_not_measured_again(tmp_path, monkeypatch, capsys):
-    table = tmp_path / "ladder.csv"
-    write_rows(table, TABLE[:2])
-    assert [float(old["held_out_abs"]) for old in read_rows(table)] == [0.0103, 0.02]
-    measured = []
-
-    def measure(inputs, clip, candidate, given):
-        measured.append((clip, candidate, given))
-        return [row(clip, candidate, mesh, 0.01, 60.0) for mesh in ("tracked", "refined")]
-
-    monkeypatch.setattr(model_selection, "measure", measure)
-    monkeypatch.setattr(model_selection, "compile_loops", lambda: None)
-    monkeypatch.setattr(model_selection, "read_inputs", lambda *folders: None)
-    arguments = ["--candidates", "auto", "least", "cubemap_16", "--set", "points=500", "--out", str(table)]
-    assert main([str(tmp_path / "a"), *arguments]) == 0
-    assert measured == [("a", "cubemap_16", {"points": "500"})]
-    assert len(read_rows(table)) == 4
-    assert "a: error 1.030 (mean squares 1.030), time 0.20 of cubemap_16, tracked" in capsys.readouterr().out
+@pytest.mark.parametrize("candidate", CANDIDATES)
+def test_its_settings_are_the_stages(candidate):
+    assert settings_of(CANDIDATES[candidate]).appearance.light_model == CANDIDATES[candidate].get(
+        "light_model", "cubemap")

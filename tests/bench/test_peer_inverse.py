@@ -76,7 +76,7 @@ def test_it_descends_and_writes_a_result(peer, clip, tmp_path):
     for _ in range(60):
         solver.step()
     assert error() < 0.5 * before
-    peer.write_result(tmp_path / "60", solver, np.arange(9), clip.intrinsics)
+    peer.write_result(tmp_path / "60", solver, np.arange(9), clip.lens)
     albedo = read_exr(tmp_path / "60" / "maps" / "diffuse_albedo.exr")
     assert albedo.shape == (MAP, MAP, 3) and albedo.std() > 0.02
     assert load_arrays(tmp_path / "60" / "poses.npz")["camera_from_head"].shape == (9, 4, 4)

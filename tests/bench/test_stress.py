@@ -7,8 +7,9 @@ import pytest
 
 from shared.geometry.transforms import project, rigid, vector_from_rotation
 from shared.imaging.color import decode_srgb
-from shared.io.arrays import read_json, write_json
-from tools.bench.stress import command
+from shared.io.arrays import read_json
+from tools.bench.runner import Table, run
+from tools.bench.stress.bench import StressBench, missing_cases, verdicts
 from tools.bench.stress.camera import Sensor, compressed, defocused, drift, photograph, shaken, smeared
 from tools.bench.stress.perturbations import PERTURBATIONS, Perturbation, StressCase
 from tools.bench.stress.scenes import StressScene, smile_of
@@ -119,7 +120,7 @@ def row(exit_code=0, warnings=(), missed=(), **worse):
     (row(), RIGHT, ()),
     (row(warnings=["the focus is off by 3 px"]), WARNED, ()),
     (row(normals=99.0), SILENT, ("normals",)),
-    (row(normals=float("nan")), SILENT, ("normals",)),
+    (row(normals=None), SILENT, ("normals",)),
     (row(normals=99.0, warnings=["the focus is off by 3 px"]), SAID, ("normals",)),
     (row(normals=99.0, warnings=["only 7 usable frames"]), SILENT, ("normals",)),
     (row(normals=99.0, warnings=["out of focus in 31 of 32 frames"]), SILENT, ("normals",)),
@@ -165,73 +166,76 @@ TOY = (Perturbation("toy", "a toy", "units", (1.0, 2.0), lambda s: StressCase(fo
        Perturbation("other", "another", "units", (1.0,), lambda s: StressCase(keep=5), "other"))
 
 
+class ToyStress(StressBench):
+    """Cases that need no rendering; ran: their names in the order in which they were run."""
+
+    perturbations, ran, version = TOY, [], "this code"
+
+    @property
+    def code(self):
+        return self.version
+
+    def measure(self, case, entry):
+        self.ran.append(entry.name)
+        own = {"toy_1": row(warnings=["a toy"]), "toy_2": row(normals=99.0, albedo=float("nan"))}
+        entry.table.drop(entry.name, entry.repeat)
+        entry.add({"digest": case.digest, "code": self.code, "making_s": 1.0, "seconds": 1.0,
+                   **own.get(entry.name, row())})
+
+
 @pytest.fixture
-def toy(monkeypatch):
-    """Cases that need no rendering: [names in the order in which they were run]."""
-    ran = []
-
-    def do(name, case, work, version):
-        ran.append(name)
-        own = row(normals=99.0) if name == "toy_2" else row(warnings=["another toy"] if name == "toy_1" else [])
-        write_json(command.row_file(work, case), {"name": name, "code": version, "seconds": 1.0, **own})
-
-    monkeypatch.setattr(command, "PERTURBATIONS", TOY)
-    monkeypatch.setattr(command, "do_case", do)
-    return ran
+def toy(tmp_path):
+    ToyStress.ran.clear()
+    return lambda *words: run(ToyStress, "stress", ["--out", str(tmp_path), "--work", str(tmp_path), *words])
 
 
-def test_rows_are_kept_and_only_what_is_missing_runs(toy, tmp_path, monkeypatch, capsys):
-    assert command.main([str(tmp_path)]) == 1
-    assert toy == ["unspoilt", "toy_2", "other_1", "toy_1"]
-    assert "wrong and silent, or failed: toy 2" in capsys.readouterr().out
-    command.main([str(tmp_path)])
-    assert len(toy) == 4
-    command.row_file(tmp_path, TOY[1].make(1.0)).unlink()
-    command.main([str(tmp_path)])
-    assert toy[4:] == ["other_1"]
-    monkeypatch.setattr(command, "code_version", lambda: "other code")
-    command.main([str(tmp_path), "--keep-old"])
-    assert len(toy) == 5
+def test_rows_are_kept_and_only_what_is_missing_runs(toy, tmp_path, monkeypatch):
+    assert toy() == 1 and ToyStress.ran == ["unspoilt", "toy_2", "other_1", "toy_1"]
+    assert toy() == 1 and len(ToyStress.ran) == 4
+    table = Table.open(tmp_path / "stress.json", {})
+    table.drop("other_1", 0)
+    table.save()
+    assert missing_cases(table.rows, TOY) == ["another (1)"]
+    toy()
+    assert ToyStress.ran[4:] == ["other_1"]
+    monkeypatch.setattr(ToyStress, "version", "other code")
+    assert toy("--keep-old") == 1 and len(ToyStress.ran) == 5
     assert "an earlier version of a stage" in (tmp_path / "stress.md").read_text()
-    command.main([str(tmp_path), "--perturbations", "other"])
-    assert toy[5:] == ["unspoilt", "other_1"]
+    assert toy("--only", "other") == 1 and ToyStress.ran[5:] == ["unspoilt", "other_1"]
 
 
-def test_no_case_begins_after_the_minutes(toy, tmp_path, capsys):
-    assert command.main([str(tmp_path), "--minutes", "-1"]) == 2
-    assert toy == [] and "no result" in capsys.readouterr().err
+def test_without_the_unchanged_case_there_is_no_verdict(toy, tmp_path, capsys):
+    assert toy("--minutes", "-1") == 2 and ToyStress.ran == [] and "no result" in capsys.readouterr().err
+    assert verdicts([{"digest": TOY[0].make(1.0).digest, **row()}], TOY) == []
 
 
-def test_table_and_chart_show_every_row(toy, tmp_path):
-    command.main([str(tmp_path), "--docs", str(tmp_path / "docs")])
-    with open(tmp_path / "docs" / "stress.csv", encoding="utf-8") as file:
+def test_verdicts_stand_in_the_table_the_page_and_the_picture(toy, tmp_path):
+    toy()
+    with open(tmp_path / "stress.csv", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [(r["dial"], r["severity"], r["verdict"]) for r in rows] == [
         ("toy", "0", RIGHT), ("toy", "1", WARNED), ("toy", "2", SILENT), ("other", "0", RIGHT), ("other", "1", RIGHT)]
-    page = (tmp_path / "docs" / "stress.md").read_text()
+    assert rows[2]["wrong"] == "albedo normals" and rows[2]["albedo"] == ""
+    page = (tmp_path / "stress.md").read_text()
     assert "| a toy | 2 units |" in page and "**99**" in page
     assert "3 cases, wrong and silent or failed: 1" in page and "Not run yet" not in page
-    chart = (tmp_path / "docs" / "stress.svg").read_text()
+    chart = (tmp_path / "stress.svg").read_text()
     assert chart.count("<polyline") == 2 * len(LIMITS) and chart.count("<title>") == 5
-    command.row_file(tmp_path, TOY[0].make(1.0)).unlink()
-    assert command.main([str(tmp_path), "--table"]) == 1
-    assert "Not run yet: a toy (1)." in (tmp_path / "stress.md").read_text()
 
 
-def test_an_unknown_perturbation_is_refused(tmp_path, capsys):
-    assert command.main([str(tmp_path), "--perturbations", "rain"]) == 2
-    assert "no such perturbation" in capsys.readouterr().err and not (tmp_path / "rows").exists()
+def test_an_unknown_perturbation_is_refused(toy, tmp_path):
+    assert toy("--only", "rain") == 2 and not (tmp_path / "stress.json").exists()
 
 
 def test_a_row_tells_what_was_run(tmp_path, monkeypatch):
-    """do_case itself, with a subject that cannot be read: refused, and kept as such."""
+    """StressBench itself, with a subject that cannot be read: refused, and kept as such."""
     def refused(case, folder, scenes):
         folder.mkdir(parents=True)
         (folder / "subject.yaml").write_text("video: absent.mp4\n")
         return folder
 
-    monkeypatch.setattr("tools.bench.stress.subject.make_subject", refused)
-    (tmp_path / "rows").mkdir()
-    command.do_case("toy", StressCase(), tmp_path, "code")
-    kept = read_json(command.row_file(tmp_path, StressCase()))
-    assert kept["exit"] == 2 and "absent.mp4" in kept["message"] and kept["code"] == "code"
+    monkeypatch.setattr("tools.bench.stress.bench.make_subject", refused)
+    words = ["--out", str(tmp_path), "--work", str(tmp_path), "--only", "unspoilt"]
+    assert run(StressBench, "stress", words) == 2  # nothing to compare with
+    (kept,) = read_json(tmp_path / "stress.json")["rows"]
+    assert kept["exit"] == 2 and "absent.mp4" in kept["message"] and kept["code"].startswith("1.")

@@ -1,6 +1,5 @@
 """The chart of speed against accuracy: its cases, its measuring, its table."""
 
-import csv
 import shutil
 import sys
 
@@ -10,16 +9,18 @@ from toy_runs import TOY, make_subject
 from toy_tradeoff import ERROR, LIKENESS, POINTS
 
 from shared.contract.confine import trust
-from shared.contract.pipeline import load_pipeline
+from shared.contract.pipeline import REPOSITORY, load_pipeline
 from shared.contract.subject import load_subject
 from shared.errors import InputError
 from shared.io.arrays import load_arrays, read_json, save_arrays, write_json
-from tools.bench.chart import command as chart
+from tools.bench.chart import bench as chart
 from tools.bench.chart import runs as tradeoff_runs
-from tools.bench.chart.cases import ABLATIONS, GROUPS, PEER, PRESET, QUICK, ChartCase, all_cases, chosen_cases
-from tools.bench.chart.rows import Rows, csv_row, higher_is_better, pareto_front, row_costs, summarise
-from tools.bench.chart.runs import ProcessCost, Runs, Solved, fingerprints, measured
+from tools.bench.chart.bench import ChartBench
+from tools.bench.chart.cases import ABLATIONS, GROUPS, PRESET, QUICK, ChartCase, all_cases
+from tools.bench.chart.rows import chart_row, csv_row, higher_is_better, pareto_front, row_costs, summarise
+from tools.bench.chart.runs import ProcessCost, Runs, Solved, fingerprints
 from tools.bench.chart.scores import flat, scores_of
+from tools.bench.runner import Table, run
 from tools.goldens.tiny import TINY_SUBJECT
 from tools.scoring.score import camera_intrinsics, score
 
@@ -47,23 +48,7 @@ def test_a_larger_clip_has_more_cases():
     assert set(QUICK) <= set(ABLATIONS)
 
 
-def test_words_choose_cases():
-    cases = all_cases(load_pipeline(), "draft", "quick", CLIP)
-    assert [case.name for case in chosen_cases(cases, ["matte", "standard"])] == ["draft, matte", "standard"]
-    assert [case.name for case in chosen_cases(cases, ["draft"])] == ["draft"]
-    with pytest.raises(InputError, match="no such case.*sparkle"):
-        chosen_cases(cases, ["sparkle"])
-
-
 # ---------------------------------------------------------------- measuring
-def test_a_process_is_measured(tmp_path):
-    work = "import time; t = time.process_time()\nwhile time.process_time() < t + 0.3: pass"
-    cost = measured([sys.executable, "-c", f"{work}\ntime.sleep(0.3)"], tmp_path / "log")
-    assert cost["wall_s"] > 0.55 and 0.28 < cost["cpu_s"] < cost["wall_s"] and cost["others"] >= 0.0
-    with pytest.raises(InputError, match="the last word.*exit code 3"):
-        measured([sys.executable, "-c", "print('the last word'); raise SystemExit(3)"], tmp_path / "log")
-
-
 @pytest.fixture
 def toy(tmp_path, monkeypatch):
     """Runs over the toy pipeline, whose draw_bars stands for the solver."""
@@ -123,56 +108,30 @@ def test_a_stage_that_fails_says_why_and_leaves_the_earlier_ones(toy, monkeypatc
 
 
 # ---------------------------------------------------------------- the table
-def solved(seconds, digest="d0"):
+def solved(seconds, digest="d0", at=None):
     costs = {"sample_frames": ProcessCost(5.0, 6.0, 100.0, 0.5),
              "inverse_render": ProcessCost(seconds, 2 * seconds, 900.0, 0.0),
              "export_usd": ProcessCost(7.0, 7.0, 1500.0, 0.0)}  # fmt: skip
-    return Solved(None, digest, costs, fingerprints(["tools/bench/chart/rows.py"]))
+    return Solved(None, digest, costs, fingerprints(["tools/bench/chart/rows.py"]), at)
 
 
 @pytest.fixture
-def rows(tmp_path):
-    found = Rows.open(tmp_path / "chart.json", "someone", "key")
-    case = ChartCase("draft", PRESET, "draft")
-    for repeat, seconds in enumerate((20.0, 10.0, 15.0)):
-        found.add(case, repeat, 2, solved(seconds), {ERROR: 1.5, "pose.frames": 48.0})
-    found.save()
-    return found
-
-
-def test_rows_come_back_as_long_as_code_and_subject_are_the_same(rows, monkeypatch):
-    case = ChartCase("draft", PRESET, "draft")
-    again = Rows.open(rows.path, "someone", "key")
-    assert again.rows == rows.rows and again.dropped == 0
-    assert again.has(case, 2, 2) and not again.has(case, 3, 2) and not again.has(case, 2, 1)
-    assert not again.has(ChartCase("draft", PRESET, "draft", ("a.b=1",)), 2, 2)
-    assert again.scores_of("d0")[ERROR] == 1.5 and again.scores_of("other") is None
-    assert Rows.open(rows.path, "someone", "another clip").dropped == 3
-    monkeypatch.setitem(tradeoff_runs._known, "tools/bench/chart/rows.py", "changed")
-    stale = Rows.open(rows.path, "someone", "key")
-    assert stale.rows == [] and stale.dropped == 3
-
-
-def test_a_peer_is_measured_when_all_its_seconds_are(rows):
-    case = ChartCase("Mitsuba", PEER, "draft", seconds=(60.0, 120.0))
-    for at in case.seconds:
-        assert not rows.has(case, 0, 2)
-        rows.add(case, 0, 2, Solved(None, f"m{at}", {"Mitsuba": ProcessCost(at, at, 1.0, 0.0)}, {}, at), {ERROR: 3.0})
-    assert rows.has(case, 0, 2) and rows.rows[-1]["case"] == "Mitsuba, 120 s"
+def rows():
+    case, scores = ChartCase("draft", PRESET, "draft"), {ERROR: 1.5, "pose.frames": 48.0}
+    return [chart_row(case, 2, solved(seconds), {}, scores) | {"repeat": k}
+            for k, seconds in enumerate((20.0, 10.0, 15.0))]
 
 
 def test_costs_are_those_up_to_the_maps(rows):
-    costs = row_costs(rows.rows[0])
+    costs = row_costs(rows[0])
     assert costs["seconds"] == 25.0 and costs["seconds_with_export"] == 32.0
     assert costs["cpu_seconds"] == 46.0 and costs["peak_mb"] == 900.0 and costs["others"] == 0.1
-    with open(rows.path.with_suffix(".csv"), encoding="utf-8") as file:
-        table = list(csv.DictReader(file))
-    assert len(table) == 3 and float(table[1]["inverse_render_s"]) == 10.0 and float(table[0][ERROR]) == 1.5
-    assert csv_row(rows.rows[0])["settings"] == "draft"
+    line = csv_row(rows[1])
+    assert line["inverse_render_s"] == 10.0 and line[ERROR] == 1.5 and line["settings"] == "draft"
 
 
 def test_repeats_become_their_median(rows):
-    (found,) = summarise(rows.rows)
+    (found,) = summarise(rows)
     assert found["seconds"] == 20.0 and found["ranges"]["seconds"] == [15.0, 25.0] and found["repeats"] == 3
     assert found["stages"]["inverse_render"] == 15.0 and found["scores"][ERROR] == 1.5
 
@@ -217,57 +176,64 @@ def test_a_solved_stage_is_scored_with_pictures(tiny_run):
     assert scores["rerender.psnr"] == pytest.approx(exported["rerender.psnr"], abs=0.5)
 
 
-# ---------------------------------------------------------------- the command
+# ---------------------------------------------------------------- the bench
 @pytest.fixture
-def command(tmp_path, monkeypatch):
-    """chart.main on the tiny subject with a stand-in for the stages; calls: (repeat, case) in order."""
+def bench(tmp_path, monkeypatch):
+    """Runs the chart of the tiny subject with a stand-in for the stages -> chart.json; calls: (repeat, case)."""
     calls = []
 
     class StandIn(Runs):
         def solve(self, case):
             calls.append((self.work.name, case.name))
-            if case.name == "draft, matte" and "fail" in calls[0]:
-                raise InputError("failed", got="a stage")
-            return [solved(10.0 + len(calls), f"digest of {case.name}")]
+            return [solved(10.0 + len(calls), f"digest of {case.name}", at) for at in case.seconds or (None,)]
 
     monkeypatch.setattr(chart, "Runs", StandIn)
     monkeypatch.setattr(chart, "scores_of", lambda subject, folder: {ERROR: 1.0 + 0.1 * len(calls)})
-    folders = ["--out", str(tmp_path / "out"), "--work", str(tmp_path / "work")]
-    chosen = ["--only", "draft", "standard", "matte"]
-    return lambda *more: chart.main([str(TINY_SUBJECT), *folders, *chosen, *more]), calls, tmp_path / "out"
+    folders = ["--out", str(tmp_path / "out"), "--work", str(tmp_path / "work"), "--peer-python", sys.executable]
+
+    def measure(*words):
+        assert run(ChartBench, "chart", [str(TINY_SUBJECT), *folders, *words]) == 0
+        return read_json(tmp_path / "out" / "chart.json")
+
+    return measure, calls, tmp_path / "out"
 
 
-def test_all_cases_are_measured_before_any_is_again(command):
-    run, calls, out = command
-    assert run("--repeats", "2") == 0
-    names = ["draft", "standard", "draft, matte"]
-    assert calls == [("repeat0", name) for name in names] + [("repeat1", name) for name in names]
-    rows = read_json(out / "chart.json")["rows"]
-    assert len(rows) == 6 and rows[0]["scores"] == rows[3]["scores"] != rows[1]["scores"]
-    assert "draft" in (out / "chart.svg").read_text() and "standard" in (out / "chart.html").read_text()
-    assert run("--repeats", "3") == 0
-    assert calls[6:] == [("repeat2", name) for name in names]
+def test_a_result_is_scored_once_and_a_peer_has_a_row_for_each_of_its_seconds(bench):
+    measure, calls, out = bench
+    words = "--only", "standard", "matte", "Mitsuba", "--repeats", "2"
+    content = measure(*words)
+    assert [row["case"] for row in content["rows"][:4]] == ["standard", "draft, matte", "Mitsuba, 45 s",
+                                                            "Mitsuba, 120 s"]
+    assert [row["repeat"] for row in content["rows"]] == [0] * 4 + [1] * 4
+    assert content["rows"][0]["scores"] == content["rows"][4]["scores"] != content["rows"][1]["scores"]
+    assert measure(*words) == content and len(calls) == 6
+    assert {path.name for path in out.iterdir()} == {f"chart.{kind}" for kind in ("json", "csv", "md", "svg")}
 
 
-def test_a_case_that_fails_does_not_stop_the_others(command, capsys):
-    run, calls, out = command
-    calls.append("fail")
-    assert run("--repeats", "1") == 1
-    assert [row["case"] for row in read_json(out / "chart.json")["rows"]] == ["draft", "standard"]
-    assert "failed: draft, matte" in capsys.readouterr().err
-    calls.clear()
-    calls.append("from now on it works")
-    assert run("--repeats", "1") == 0 and calls[1:] == [("repeat0", "draft, matte")]
+def test_rows_come_back_as_long_as_the_code_is_the_same(bench, monkeypatch):
+    measure, calls, _ = bench
+    content = measure("--only", "draft")
+    assert [set(content["code"])] == [{row["code"]} for row in content["rows"]]
+    monkeypatch.setitem(tradeoff_runs._known, "tools/bench/chart/rows.py", "changed")
+    assert set(measure("--only", "draft")["code"]).isdisjoint(content["code"]) and len(calls) == 2
 
 
-def test_no_case_begins_when_the_minutes_are_over(command):
-    run, calls, _ = command
-    assert run("--minutes", "0") == 0 and calls == []
+def test_other_threads_are_another_measurement(bench, monkeypatch):
+    measure, calls, _ = bench
+    measure("--only", "draft")
+    monkeypatch.setattr(chart.os, "sched_getaffinity", lambda process: range(1000))
+    (row,) = measure("--only", "draft")["rows"]
+    assert row["threads"] == 1000 and len(calls) == 2
 
 
-def test_it_lists_what_is_there_and_wants_a_truth(command, tmp_path, capsys):
-    run, calls, _ = command
-    assert run("--list") == 0 and calls == []
-    assert "draft, matte: 0 of 1; draft inverse_render.specular=false" in capsys.readouterr().out
-    assert chart.main([str(make_subject(tmp_path / "poem"))]) == 2
+def test_a_subject_without_truth_is_refused(tmp_path, capsys):
+    subject = make_subject(tmp_path / "poem")
+    assert run(ChartBench, "chart", [str(subject), "--out", str(tmp_path / "out"), "--work", str(tmp_path)]) == 2
     assert "no ground truth" in capsys.readouterr().err
+
+
+def test_the_published_table_can_still_be_read():
+    """docs/chart.json, from which the README's table is made."""
+    table = Table.open(REPOSITORY / "docs" / "chart.json", {"schema": chart.SCHEMA})
+    assert {"draft", "standard"} <= {point["name"] for point in summarise(table.rows)} and not table.dropped
+    assert all(row["code"] in table.beside["code"] and csv_row(row)["case"] == row["case"] for row in table.rows)

@@ -1,6 +1,6 @@
-"""Measurements for developers, each a command of its own: python -m tools.bench.<name> --help.
+"""Measurements for developers: python -m tools.bench NAME --help; without a NAME, their names.
 
-Read in this order: svg_file, appearance, shape, model_selection, published, degrade, tracking, colour_chart, statue,
-shading.
-May import: shared, stages, tools.synthesis, tools.scoring, tools.bench.peers, tools.bench.chart.
+Read in this order: runner, drawing, clips, shape, model_selection, published, tracking, colour_chart, statue, shading.
+May import: shared, stages, tools.synthesis, tools.scoring, tools.bench.runner, tools.bench.drawing, tools.bench.peers,
+tools.bench.chart, tools.bench.stress.
 """

@@ -1,9 +1,9 @@
 """Measures what a colour chart says of the light's scale, over places and tilts beside a synthetic head.
 
-    python -m tools.bench.colour_chart [--lights room sky ...] [--places 8] [--seed 0]
+    python -m tools.bench colour_chart --out DIR [--only room sky ...] [--places 8] [--seed 0]
 
 A chart is drawn beside a random head in the given light, found in the picture as sample_frames finds it, and asked for
-the factor that the true light lacks: none, so that what it says is its error. Printed per light: how many charts were
+the factor that the true light lacks: none, so that what it says is its error. A row per light: how many charts were
 used, the error of the log factor (median of its size, root mean square), the same over the deviation that it states
 (about 1 if that is honest), and the error of the ratios between channels.
 """
@@ -22,6 +22,7 @@ from shared.contract.chart_place import AUTO
 from shared.geometry.transforms import rigid, rotation_from_vector
 from shared.rendering.envmap import cube_from_latlong
 from shared.tracking.models import load_head_model
+from tools.bench.runner import Bench, Entry
 from tools.synthesis.camera import PinholeCamera
 from tools.synthesis.chart import PlacedChart, add_chart
 from tools.synthesis.head import Head, random_head
@@ -77,26 +78,32 @@ def measure(light: str, places: int, seed: int) -> np.ndarray:
     return np.array(said).reshape(-1, 2, 3)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--lights", nargs="*", default=list(ENVIRONMENTS), choices=ENVIRONMENTS)
-    parser.add_argument("--places", type=int, default=8, help="charts in each light (default 8)")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args(arguments)
-    print("light     used  median    rms  rms/stated  ratios")
-    for light in options.lights:
-        found = measure(light, options.places, options.seed)
-        error, stated = found[:, 0], found[:, 1]
-        ratios = error - error.mean(1, keepdims=True)
-        print(f"{light:8s} {len(found):5d} {np.median(np.abs(error)):7.3f} {_rms(error):6.3f} "
-              f"{_rms(error / stated):11.2f} {_rms(ratios):7.4f}", flush=True)
-    return 0
+def summary(found: np.ndarray) -> dict[str, float]:
+    """The row of a light from measure's errors and stated deviations."""
+    error, stated = found[:, 0], found[:, 1]
+    return {"used": len(found), "median": np.median(np.abs(error)) if len(found) else np.nan, "rms": _rms(error),
+            "rms_over_stated": _rms(error / stated), "ratios": _rms(error - error.mean(1, keepdims=True))}
 
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+class ColourChartBench(Bench):
+    """Charts in each light."""
+
+    name, columns = "colour_chart", ("case", "used", "median", "rms", "rms_over_stated", "ratios")
+
+    @classmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--places", type=int, default=8, help="charts in each light (8)")
+        parser.add_argument("--seed", type=int, default=0)
+
+    def facts(self) -> dict[str, int]:
+        return {"places": self.options.places, "seed": self.options.seed}
+
+    def cases(self) -> dict[str, str]:
+        return {light: light for light in ENVIRONMENTS}
+
+    def measure(self, case: str, entry: Entry) -> None:
+        entry.add(summary(measure(case, self.options.places, self.options.seed)))

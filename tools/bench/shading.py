@@ -1,9 +1,9 @@
 """Our shading against a path tracer that is not ours (Mitsuba 3): diffuse light, one bounce, highlights by roughness.
 
-    python -m tools.bench.shading OUT [--samples 256] [--pixels 96] [--mesh head statue] [--light window]
+    python -m tools.bench shading --out DIR [--samples 256] [--pixels 96] [--only head statue] [--light window]
 
-Writes   OUT/shading.csv (one row per mesh, quantity and roughness), OUT/specular.svg (errors of the highlights over
-         the roughness, all meshes), and one EXR of ours, theirs and their ratio per row under OUT/pictures. split_sum
+Writes   DIR/shading.csv (one row per mesh, quantity and roughness), DIR/specular.svg (errors of the highlights over
+         the roughness, all meshes), and one EXR of ours, theirs and their ratio per row under DIR/pictures. split_sum
          and direction_sum are the transfer solver's two ways of making a lobe, published_* the reference solver's
          renderer.
 Compares radiance of the pixels that the mesh fills. mean: ratio of the sums, minus one. rms: root mean square error
@@ -14,17 +14,16 @@ Needs    pip install mitsuba.
 from __future__ import annotations
 
 import argparse
-import csv
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from importlib.util import find_spec
 
 import cv2
 import numpy as np
 import torch
 
 from shared.appearance.observations import face_front
+from shared.errors import InputError
 from shared.geometry.mesh import Mesh, normalised, subdivide
 from shared.geometry.transforms import camera_centres
 from shared.imaging.image_sampling import SurfaceViewer
@@ -40,9 +39,10 @@ from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
 from shared.rendering.transfer import Transfer, irradiance, mesh_points, node_radiosity
 from shared.rendering.views import ViewCamera, orbit_camera
 from shared.tracking.models import load_head_model
+from tools.bench.drawing import line_chart
 from tools.bench.peers.mitsuba import ALL_BOUNCES, DIRECT, ONE_BOUNCE, Coat, path_trace
+from tools.bench.runner import Bench, Entry, Table
 from tools.bench.statue import statue
-from tools.bench.svg_file import save_line_chart
 
 SKIN = (0.60, 0.38, 0.28)
 ROUGHNESSES = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -218,56 +218,51 @@ def measure(
     return rows
 
 
-def chart(path: Path, rows: list[dict]) -> None:
+def chart(rows: Sequence[dict]) -> str:
     """Root mean square error of the highlights over roughness, one curve per mesh and way; 0: lost in the noise."""
-    curves = {}
-    for mesh in dict.fromkeys(row["mesh"] for row in rows):
-        for way in ("split_sum", "direction_sum", "published_split_sum"):
-            own = [row for row in rows if (row["mesh"], row["quantity"]) == (mesh, way)]
-            percent = np.array([100.0 * max(0.0, float(row["rms"])) for row in own])
-            curves[f"{mesh}: {way.replace('_', ' ')}"] = np.where(percent < LARGEST_SHOWN, percent, np.nan)
-    save_line_chart(
-        path, ROUGHNESSES, curves, x_label="roughness", y_label="rms error of the highlight, %", from_zero=True
-    )
+    curves: dict[str, list[tuple[float, float]]] = {}
+    for row in rows:
+        if row["quantity"] in ("split_sum", "direction_sum", "published_split_sum"):
+            percent = 100.0 * max(0.0, row["rms"])
+            place = row["roughness"], percent if percent < LARGEST_SHOWN else float("nan")
+            curves.setdefault(f"{row['mesh']}: {row['quantity'].replace('_', ' ')}", []).append(place)
+    return line_chart(curves, "roughness", "rms error of the highlight, %")
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Command line; exit code 2 where Mitsuba is missing."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--samples", type=int, default=256, help="paths per pixel")
-    parser.add_argument("--pixels", type=int, default=96, help="edge of the pictures")
-    parser.add_argument("--directions", type=int, default=SIZES.directions, help="directions of the transfer")
-    parser.add_argument("--mesh", nargs="*", default=list(MESHES), choices=MESHES)
-    parser.add_argument("--light", default="window", choices=STUDIO_LIGHTS)
-    options = parser.parse_args(arguments)
-    try:
-        import mitsuba  # noqa: F401
-    except ImportError:
-        print("error: Mitsuba is not installed; pip install mitsuba", file=sys.stderr)
-        return 2
-    (options.out / "pictures").mkdir(parents=True, exist_ok=True)
+class ShadingBench(Bench):
+    """Every mesh."""
 
-    def keep(label: str, ours: np.ndarray, theirs: np.ndarray) -> None:
+    name, columns = "shading", ("mesh", "quantity", "roughness", "pixels", "mean", "rms", "noise")
+
+    @classmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--samples", type=int, default=256, help="paths per pixel")
+        parser.add_argument("--pixels", type=int, default=96, help="edge of the pictures")
+        parser.add_argument("--directions", type=int, default=SIZES.directions, help="directions of the transfer")
+        parser.add_argument("--light", default="window", choices=STUDIO_LIGHTS)
+
+    def facts(self) -> dict[str, object]:
+        return {name: getattr(self.options, name) for name in ("samples", "pixels", "directions", "light")}
+
+    def cases(self) -> dict[str, Callable[[], Mesh]]:
+        return MESHES
+
+    def measure(self, case: Callable[[], Mesh], entry: Entry) -> None:
+        if find_spec("mitsuba") is None:
+            raise InputError("Mitsuba is not installed", where="shading", hint="pip install mitsuba")
+        sizes = replace(SIZES, directions=self.options.directions)
+        stage = TracedView.of(case(), studio_light(self.options.light), self.options.pixels, sizes)
+        entry.add(*measure(entry.name, stage, self.options.samples, self.keep))
+
+    def keep(self, label: str, ours: np.ndarray, theirs: np.ndarray) -> None:
+        """Writes the picture of ours, theirs and their ratio."""
+        folder = self.options.out / "pictures"
+        folder.mkdir(parents=True, exist_ok=True)
         ratio = np.where(theirs > 1e-4, ours / np.maximum(theirs, 1e-4), 1.0)
         picture = np.hstack([ours, theirs, ratio]).astype(np.float32)
-        write_exr(options.out / "pictures" / f"{label}.exr", picture, colour_space="lin_rec709_scene")
+        write_exr(folder / f"{label}.exr", picture, colour_space="lin_rec709_scene")
 
-    rows = []
-    for name in options.mesh:
-        sizes = replace(SIZES, directions=options.directions)
-        stage = TracedView.of(MESHES[name](), studio_light(options.light), options.pixels, sizes)
-        own = measure(name, stage, options.samples, keep)
-        for row in own:
-            print(" ".join(f"{v:.4f}" if isinstance(v, float) else str(v) for v in row.values()), flush=True)
-        rows += own
-    chart(options.out / "specular.svg", rows)
-    with open(options.out / "shading.csv", "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    def conclude(self, table: Table) -> int:
+        if table.rows:
+            (self.options.out / "specular.svg").write_text(chart(table.rows), encoding="utf-8")
+        return 0

@@ -1,34 +1,38 @@
-"""How tracking stands up to bad clips: a table of errors over perturbations of subjects with known truth.
+"""How well heads are tracked: errors on subjects with known truth (tracking), and how far the poses of a clip are from
+those of the same clip run backwards, for which no truth is needed (backwards).
 
-    python -m tools.bench.tracking SUBJECT... --out DIR [--degrade [--cases flicker,...]]
-    python -m tools.bench.tracking SUBJECT... --out DIR --backwards
+    python -m tools.bench tracking SUBJECT... --out DIR
+    python -m tools.bench backwards SUBJECT... --out DIR
 
-Runs sample_frames and track_landmarks on each subject as it is, and with --degrade on the degraded copies of the first
-(tools/bench/degrade.py) as well. Writes DIR/tracking.csv and tracking.md. Rotations are compared after one common turn
-of the head, so that the mesh does not enter; the head's place across the view and in depth after the mesh's alignment,
-as tools.score does. `covered`: share of frames whose true rotation error lies within the 90 %
-region of the reported covariance. With --backwards no truth is needed: each clip is tracked from its first frame and
-from its last, and DIR/backwards.csv and .md say how far the poses are apart.
+Runs sample_frames and track_landmarks on each subject. Rotations are compared after one common turn of the head, so
+that the mesh does not enter; the head's place across the view and in depth after the mesh's alignment, as tools.score
+does. `covered`: share of frames whose true rotation error lies within the 90 % region of the reported covariance.
+backwards: each clip is tracked from its first frame and from its last. What bad clips do to tracking is measured by
+tools.bench.stress.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
+import yaml
 
+from shared.contract.subject import load_subject
 from shared.errors import InputError
 from shared.io.arrays import load_arrays, read_json
+from shared.io.images import write_png
 from shared.io.meshes import load_mesh
+from shared.io.video import open_video
 from shared.tracking.pose_uncertainty import rotations_apart
-from tools.bench import degrade as perturb
+from stages.sample_frames import STAGE as SAMPLED
+from stages.track_landmarks import STAGE as TRACKED
+from tools.bench.runner import Bench, Entry, measured
 from tools.scoring.score import score_geometry
 
+STAGES = ("sample_frames", "track_landmarks")
 COVERED_CHI_SQUARED = 6.251
 """90 % of a chi-squared variable of three degrees of freedom."""
 
@@ -40,17 +44,16 @@ COLUMNS = (
 BACKWARDS_COLUMNS = ("clip", "frames", "rotation_mean_deg", "rotation_max_deg", "deviation_deg", "focal_gains")
 
 
-def run_stage(stage: str, subject: Path, out: Path) -> float:
-    """Seconds that one stage took. InputError with the stage's own words when it fails."""
-    began = time.monotonic()
-    command = [sys.executable, "-m", f"stages.{stage}", "--subject", str(subject), "--out", str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise InputError(f"{stage} failed", where=str(subject), got=done.stderr.strip().splitlines()[-1])
-    return time.monotonic() - began
+def track(subject: Path, out: Path) -> float:
+    """Seconds that sample_frames and track_landmarks took. InputError with their own words when one fails."""
+    seconds = 0.0
+    for stage in STAGES:
+        command = [sys.executable, "-m", f"stages.{stage}", "--subject", str(subject), "--out", str(out)]
+        seconds += measured(command, out / f"{subject.name}_{stage}.log")["wall_s"]
+    return seconds
 
 
-def measure(subject: Path, work: Path) -> dict[str, object]:
+def errors_of(subject: Path, work: Path) -> dict[str, object]:
     """Errors of one tracked subject against its truth."""
     tracked = work / "track_landmarks"
     found, record = load_arrays(tracked / "poses.npz"), read_json(tracked / "tracking.json")
@@ -81,50 +84,27 @@ def measure(subject: Path, work: Path) -> dict[str, object]:
     }
 
 
-def degraded_copies(subject: Path, tracked: Path, folder: Path) -> dict[str, Path]:
-    """{case: subject}; made once, reused later."""
-    frames = len(load_arrays(subject / "gt" / "poses.npz")["camera_from_head"])
-    cases = {
-        name: lambda to, f=degrade: perturb.degrade_pixels(subject, to, f) for name, degrade in perturb.PIXELS.items()
-    }
-    cases |= {
-        name: lambda to, f=degrade: perturb.degrade_landmarks(subject, tracked, to, f)
-        for name, degrade in perturb.LANDMARKS.items()
-    }
-    cases |= {
-        "focal_10_longer": lambda to: perturb.degrade_focal(subject, to, 1.1),
-        "focal_10_shorter": lambda to: perturb.degrade_focal(subject, to, 0.9),
-        "backwards": lambda to: perturb.degrade_pixels(subject, to, perturb.unchanged, slice(None, None, -1)),
-    }
-    for step in (2, 4):
-        if frames // step >= 12:
-            order = slice(None, None, step)
-            cases[f"every_{step}"] = lambda to, s=order: perturb.degrade_pixels(subject, to, perturb.unchanged, s)
-    for name, make in cases.items():
-        if not (folder / name / "subject.yaml").exists():
-            make(folder / name)
-    return {name: folder / name for name in cases}
-
-
-def bench(subject: Path, case: str, out: Path) -> dict[str, object]:
-    """One row of the table."""
-    try:
-        seconds = sum(run_stage(stage, subject, out) for stage in ("sample_frames", "track_landmarks"))
-        return {"case": case, "seconds": seconds, **measure(subject, out / subject.name / "work")}
-    except InputError as error:
-        return {"case": case, "warnings": str(error)}
+def run_backwards(subject: Path, destination: Path) -> int:
+    """Writes the subject with its frames in reverse order, without its truth, unless it is there -> how many frames."""
+    if not (destination / "subject.yaml").exists():
+        (destination / "frames").mkdir(parents=True, exist_ok=True)
+        frames = [frame.codes() for frame in open_video(load_subject(subject).video).frames()]
+        for number, codes in enumerate(reversed(frames)):
+            eight = codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8)
+            write_png(destination / "frames" / f"{number:04d}.png", eight)
+        content = yaml.safe_load((subject / "subject.yaml").read_text(encoding="utf-8"))
+        text = yaml.safe_dump({**content, "video": "frames/%04d.png"})
+        (destination / "subject.yaml").write_text(text, encoding="utf-8")
+    return len(list((destination / "frames").iterdir()))
 
 
 def both_ways(subject: Path, out: Path) -> dict[str, object]:
     """How far apart the poses are when the clip is tracked from either end. deviation_deg: what the stage reports."""
     backwards = out / "cases" / f"{subject.name}_backwards"
-    if not (backwards / "subject.yaml").exists():
-        perturb.degrade_pixels(subject, backwards, perturb.unchanged, slice(None, None, -1))
-    count = len(list((backwards / "frames").iterdir()))
+    count = run_backwards(subject, backwards)
     results, gains, deviation = [], [], 0.0
     for clip in (subject, backwards):
-        for stage in ("sample_frames", "track_landmarks"):
-            run_stage(stage, clip, out / "runs")
+        track(clip, out / "runs")
         tracked = out / "runs" / clip.name / "work" / "track_landmarks"
         found, record = load_arrays(tracked / "poses.npz"), read_json(tracked / "tracking.json")
         index = found["frame_index"] if clip is subject else count - 1 - found["frame_index"]
@@ -144,56 +124,44 @@ def both_ways(subject: Path, out: Path) -> dict[str, object]:
     }
 
 
-def write_table(rows: list[dict[str, object]], out: Path, name: str = "tracking", columns=COLUMNS) -> None:
-    """name.csv and name.md."""
-    with open(out / f"{name}.csv", "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(rows)
-    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
-    for row in rows:
-        cells = (row.get(column, "") for column in columns)
-        lines.append("| " + " | ".join(f"{c:.4g}" if isinstance(c, float) else str(c) for c in cells) + " |")
-    (out / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+class BackwardsBench(Bench):
+    """Each clip from either end."""
+
+    name, columns = "backwards", BACKWARDS_COLUMNS
+
+    @classmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("subjects", nargs="+", type=Path, help="subjects' folders")
+
+    def __init__(self, options: argparse.Namespace):
+        super().__init__(options)
+        self.subjects = {folder.resolve().name: folder.resolve() for folder in options.subjects}
+        self.out = options.out.resolve()
+
+    def facts(self) -> dict[str, int]:
+        return {stage.name: stage.version for stage in (SAMPLED, TRACKED)}
+
+    def cases(self) -> dict[str, Path]:
+        return self.subjects
+
+    def measure(self, case: Path, entry: Entry) -> None:
+        entry.add(both_ways(case, self.out))
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Command line; exit code 2 when a subject has no truth."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("subjects", nargs="+", type=Path, help="folders with subject.yaml and gt/")
-    parser.add_argument("--out", required=True, type=Path)
-    parser.add_argument("--degrade", action="store_true", help="also the degraded copies of the first subject")
-    parser.add_argument("--cases", default="", help="only these degraded copies, by commas")
-    parser.add_argument("--backwards", action="store_true", help="compare with the clip run backwards; no truth needed")
-    options = parser.parse_args(arguments)
-    if options.backwards:
-        options.out.mkdir(parents=True, exist_ok=True)
-        rows = []
-        for subject in options.subjects:
-            rows.append(both_ways(subject.resolve(), options.out))
-            write_table(rows, options.out, "backwards", BACKWARDS_COLUMNS)
-        print((options.out / "backwards.md").read_text(encoding="utf-8"))
-        return 0
-    for subject in options.subjects:
-        if not (subject / "gt" / "poses.npz").exists():
-            print(f"error: no ground truth: {subject}; see tools/synthesize.py", file=sys.stderr)
-            return 2
-    options.out.mkdir(parents=True, exist_ok=True)
-    rows = []
-    for subject in options.subjects:
-        rows.append(bench(subject.resolve(), subject.resolve().name, options.out / "runs"))
-        write_table(rows, options.out)
-    if options.degrade:
-        first = options.subjects[0].resolve()
-        tracked = options.out / "runs" / first.name / "work" / "track_landmarks"
-        copies = degraded_copies(first, tracked, options.out / "cases")
-        wanted = options.cases.split(",") if options.cases else list(copies)
-        for case in wanted:
-            rows.append(bench(copies[case], case, options.out / "runs"))
-            write_table(rows, options.out)
-    print((options.out / "tracking.md").read_text(encoding="utf-8"))
-    return 0
+class TrackingBench(BackwardsBench):
+    """Errors on each subject. A stage that refuses a clip is a result, too."""
 
+    name, columns = "tracking", COLUMNS
 
-if __name__ == "__main__":
-    sys.exit(main())
+    def __init__(self, options: argparse.Namespace):
+        super().__init__(options)
+        for folder in self.subjects.values():
+            if not (folder / "gt" / "poses.npz").exists():
+                raise InputError("no ground truth", where=str(folder), hint="see tools/synthesize.py")
+
+    def measure(self, case: Path, entry: Entry) -> None:
+        runs = self.out / "runs"
+        try:
+            entry.add({"seconds": track(case, runs), **errors_of(case, runs / case.name / "work")})
+        except InputError as error:
+            entry.add({"warnings": str(error)})

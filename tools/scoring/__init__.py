@@ -1,5 +1,5 @@
 """Scores of a result against a subject's truth.
 
-Read in this order: align, buffers, measures, table, score, appearance_errors, relighting.
+Read in this order: align, buffers, measures, table, score, appearance_errors.
 May import: shared.
 """

@@ -133,3 +133,11 @@ def surface_distance(
     plane = np.abs((offset * (normals[nearest] @ alignment.rotation.T)).sum(1))
     spacing = alignment.scale * np.median(tree.query(points[:2000], k=2)[0][:, 1])
     return np.where(distance < 6 * spacing + 2 * plane, plane, distance)
+
+
+def result_poses(truth_poses: np.ndarray, alignment: Similarity) -> np.ndarray:
+    """camera_from_head [F, 4, 4] of the truth -> of the result, in its unit; alignment: truth_from_result."""
+    poses = truth_poses.copy()
+    poses[:, :3, 3] = (truth_poses[:, :3, :3] @ alignment.translation + truth_poses[:, :3, 3]) / alignment.scale
+    poses[:, :3, :3] = truth_poses[:, :3, :3] @ alignment.rotation
+    return poses

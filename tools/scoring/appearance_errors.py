@@ -4,24 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from shared.geometry.mesh import Mesh, interpolate
-from shared.geometry.raycast import RayScene, camera_hits
-from shared.imaging.color import encode_srgb
-from shared.imaging.texture import sample_bilinear
+from shared.geometry.mesh import Mesh
 from shared.inverse.clip_inputs import ClipInputs
-from shared.inverse.problem import InverseResult
 from shared.io.arrays import load_arrays
 from shared.io.images import read_exr, read_png
-from shared.io.meshes import read_obj
-from shared.rendering.render import SurfaceMaps, render_frame
 from tools.scoring import measures
 from tools.scoring.buffers import BufferRenderer as BufferViewer
 
 CONFIDENT = 0.5
-RENDERED_FRAMES = 6
 
 
 def map_errors(
@@ -88,37 +80,3 @@ def _aligned_errors(truth: np.ndarray, found: np.ndarray) -> tuple[dict, np.ndar
         "psnr_linear": measures.psnr(truth, found * gain),
     }
     return errors, apart, gain
-
-
-def light_errors(subject: Path, latlong: np.ndarray) -> dict:
-    """Correlation and relative error of the light through a lobe of 25 degrees, everywhere and in front."""
-    size = (measures.ENVMAP_WIDTH, measures.ENVMAP_WIDTH // 2)
-    truth = cv2.resize(read_exr(subject / "gt" / "envmap.exr"), size, interpolation=cv2.INTER_AREA)
-    errors = measures.envmap_errors(truth, cv2.resize(latlong, size, interpolation=cv2.INTER_AREA))
-    return {name: errors[name] for name in ("lobe25_correlation", "lobe25_rel_rmse", "lobe25_front_correlation")}
-
-
-def render_errors(subject: Path, inputs: ClipInputs, result: InverseResult) -> dict:
-    """sRGB-coded PSNR of re-renders against the video's own frames on the face skin, fitted and held out."""
-    truth_mesh, mask = read_obj(subject / "gt" / "mesh.obj"), read_exr(subject / "gt" / "mask.exr")
-    poses = load_arrays(subject / "gt" / "poses.npz")["camera_from_head"]
-    scene, views = RayScene(truth_mesh.vertices, truth_mesh.faces), inputs.views
-    maps = SurfaceMaps(*(result.maps[name] for name in ("diffuse_albedo", "specular_intensity")))
-    errors: dict[str, list] = {"fitted": [], "held_out": []}
-    for name, chosen in (("fitted", result.fitted), ("held_out", ~result.fitted)):
-        index = np.nonzero(chosen[: len(views)])[0]
-        for f in index[np.unique(np.linspace(0, len(index) - 1, RENDERED_FRAMES).astype(int))]:
-            frame, pose = int(inputs.frame_index[f]), views.camera_from_head[f]
-            face, bary, _ = camera_hits(scene, poses[frame], inputs.lens, *views.size)
-            hit = face >= 0
-            uv = interpolate(truth_mesh.uvs, truth_mesh.face_uvs, face[hit], bary[hit])
-            skin = np.zeros(face.shape, bool)
-            skin[hit] = sample_bilinear(mask, uv).reshape(len(uv), -1)[:, 0] > 0.5
-            skin = cv2.erode(skin.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-            image, coverage = render_frame(result.viewer, result.shading, maps, f, pose, inputs.lens, views.size)
-            seen = skin & (coverage > 0.99)
-            video = views.picture(f).levels[0]
-            difference = encode_srgb(np.clip(video[seen], 0, 1)) - encode_srgb(np.clip(image[seen], 0, 1))
-            errors[name].append((float(np.square(difference).sum()), difference.size))
-    mean = {name: np.sum(parts, 0) for name, parts in errors.items()}
-    return {f"rerender_{name}": float(-10 * np.log10(total / count)) for name, (total, count) in mean.items()}

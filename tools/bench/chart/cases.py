@@ -1,12 +1,11 @@
-"""What tools/bench/chart/command.py measures: presets, ablations of one preset, the other solver, and a peer."""
+"""What tools/bench/chart/bench.py measures: presets, ablations of one preset, the other solver, and a peer."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from shared.contract.pipeline import Pipeline, split_settings
-from shared.errors import InputError
 
 PRESET, ABLATION, REFERENCE, PEER = "preset", "ablation", "reference", "peer"
 GROUPS = {
@@ -85,17 +84,6 @@ def all_cases(pipeline: Pipeline, base: str, which: str, clip: Mapping[str, floa
         cases.append(ChartCase(f"reference, {count} iterations", REFERENCE, base, settings))
     cases.append(ChartCase("Mitsuba", PEER, base, seconds=PEER_SECONDS[which]))
     return cases
-
-
-def chosen_cases(cases: Sequence[ChartCase], words: Iterable[str]) -> list[ChartCase]:
-    """Those that a word names, or else those whose name holds it; InputError where a word fits none."""
-    found = []
-    for word in words:
-        fitting = [case for case in cases if case.name == word] or [case for case in cases if word in case.name]
-        if not fitting:
-            raise InputError("no such case", where="--only", got=word, expected=", ".join(case.name for case in cases))
-        found += [case for case in fitting if case not in found]
-    return found
 
 
 def _settings(changes: Mapping[str, object]) -> tuple[str, ...]:

@@ -1,18 +1,13 @@
-"""The table behind tools/bench/chart/command.py: a row per case and repeat, its summary per case, and the Pareto
-front."""
+"""What the chart's table holds: a row per case and repeat, its summary per case, and the Pareto front."""
 
 from __future__ import annotations
 
-import csv
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
 
 from shared.contract.hashing import hash_value
-from shared.io.arrays import read_json, write_json
 from tools.bench.chart.cases import ChartCase
-from tools.bench.chart.runs import SHOWN, Solved, current_code
+from tools.bench.chart.runs import SHOWN, Solved
 
 SCHEMA = 1
 ORDER = ("sample_frames", "track_landmarks", "init_albedo", "inverse_render", "export_usd")
@@ -26,64 +21,25 @@ COSTS = {
 HIGHER_IS_BETTER = ("psnr", "correlation", "within_5mm", "coverage", "ssim")
 
 
-@dataclass
-class Rows:
-    """The rows of one subject, kept in a JSON file; code: {digest: {file: fingerprint}} of what made them."""
+def chart_row(
+    case: ChartCase, threads: int, solved: Solved, code: Mapping[str, str], scores: Mapping[str, float]
+) -> dict:
+    """A row from one result; code: {file: fingerprint} of what made and scored it."""
+    return {
+        "case": row_name(case, solved.at), "group": case.group, "settings": [case.preset, *case.settings],
+        "threads": threads, "code": code_digest(code), "result": solved.digest,
+        "stages": {stage: vars(cost) for stage, cost in solved.costs.items()}, "scores": dict(scores),
+    }  # fmt: skip
 
-    path: Path
-    subject: str
-    subject_key: str
-    rows: list[dict] = field(default_factory=list)
-    code: dict[str, dict[str, str]] = field(default_factory=dict)
-    dropped: int = 0
 
-    @classmethod
-    def open(cls, path: Path, subject: str, subject_key: str) -> Rows:
-        """What the file holds of this subject and of the code as it is now; all else is dropped and counted."""
-        found = cls(path, subject, subject_key)
-        content = read_json(path) if path.is_file() else {}
-        rows = content.get("rows", [])
-        if content.get("schema") == SCHEMA and content["subject_key"] == subject_key:
-            found.code = {key: code for key, code in content["code"].items() if current_code(code)}
-            found.rows = [row for row in rows if row["code"] in found.code]
-        found.dropped = len(rows) - len(found.rows)
-        return found
+def code_digest(code: Mapping[str, str]) -> str:
+    """By which a row names the {file: fingerprint} that made it."""
+    return hash_value(dict(code))[:SHOWN]
 
-    def has(self, case: ChartCase, repeat: int, threads: int) -> bool:
-        """Whether this repeat of a case is measured; of a peer, at all its seconds."""
-        wanted = [row_name(case, at) for at in case.seconds or (None,)]
-        settings = [case.preset, *case.settings]
-        there = [row for row in self.rows if row["repeat"] == repeat and row["threads"] == threads]
-        return all(any(row["case"] == name and row["settings"] == settings for row in there) for name in wanted)
 
-    def scores_of(self, digest: str) -> dict[str, float] | None:
-        """Scores of a result with the same content, where there is one."""
-        return next((row["scores"] for row in self.rows if row["result"] == digest), None)
-
-    def add(self, case: ChartCase, repeat: int, threads: int, solved: Solved, scores: dict[str, float]) -> dict:
-        """A row from one result; replaces an older one of its name and repeat."""
-        name, digest = row_name(case, solved.at), hash_value(dict(solved.code))[:SHOWN]
-        self.code[digest] = dict(sorted(solved.code.items()))
-        row = {
-            "case": name, "group": case.group, "settings": [case.preset, *case.settings], "repeat": repeat,
-            "threads": threads, "code": digest, "result": solved.digest,
-            "stages": {stage: vars(cost) for stage, cost in solved.costs.items()}, "scores": scores,
-        }  # fmt: skip
-        self.rows = [old for old in self.rows if (old["case"], old["repeat"]) != (name, repeat)] + [row]
-        return row
-
-    def save(self) -> None:
-        """Writes the JSON and, beside it, the same rows as CSV."""
-        unfinished = self.path.with_name(f"{self.path.name}.partial")
-        write_json(unfinished, {"schema": SCHEMA, "subject": self.subject, "subject_key": self.subject_key,
-                                "rows": self.rows, "code": self.code})  # fmt: skip
-        unfinished.replace(self.path)
-        table = [csv_row(row) for row in self.rows]
-        fields = list(dict.fromkeys(name for row in table for name in row))
-        with open(self.path.with_suffix(".csv"), "w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, fields, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(table)
+def row_names(case: ChartCase) -> list[str]:
+    """Of its rows: a peer has one for each of its seconds."""
+    return [row_name(case, at) for at in case.seconds or (None,)]
 
 
 def row_name(case: ChartCase, at: float | None) -> str:

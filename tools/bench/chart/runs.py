@@ -1,4 +1,4 @@
-"""Runs the cases of tools/bench/chart/command.py and measures each stage from outside its process.
+"""Runs the cases of tools/bench/chart/bench.py and measures each stage from outside its process.
 
 Cases that agree in their first stages share them: a run is a path in a tree of folders, one per stage and parameters,
 WORK/repeat<n>/<key>/<subject>/work/. A stage that is cut off is done again, one that is done is kept as long as its
@@ -9,14 +9,10 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-import psutil
 
 from shared.contract.declare import folder_of
 from shared.contract.hashing import hash_file, hash_value
@@ -24,9 +20,9 @@ from shared.contract.manifest import PROVENANCE, outputs_digest, read_manifest
 from shared.contract.pipeline import REPOSITORY, Pipeline, split_settings
 from shared.contract.source import fingerprint
 from shared.contract.subject import Subject
-from shared.errors import InputError
 from shared.io.arrays import read_json, write_json
 from tools.bench.chart.cases import ChartCase
+from tools.bench.runner import measured
 
 MEASURED, COST = "measured.json", "cost.json"
 SHOWN = 12
@@ -157,34 +153,3 @@ class Runs:
         for record in self.work.glob(f"*/{MEASURED}"):
             if read_json(record)["stage"] not in ("sample_frames", _TRACKED, "init_albedo"):
                 shutil.rmtree(record.parent)
-
-
-def measured(command: Sequence[str], log: Path) -> dict[str, float]:
-    """Runs a command to its end -> wall_s, cpu_s and others of its Cost; its memory only the process itself can tell
-    from that of its parent. InputError with its last words where it fails."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    environment = os.environ | {"PYTHONHASHSEED": "0", "LIMN_PARENT": str(os.getpid())}
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(REPOSITORY), os.environ.get("PYTHONPATH", "")]))
-    busy, began = _busy_seconds(), time.perf_counter()
-    with open(log, "wb") as file:
-        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=environment, cwd=REPOSITORY)
-        try:
-            _, status, usage = os.wait4(process.pid, 0)
-        except BaseException:
-            process.kill()
-            process.wait()
-            raise
-    process.returncode = os.waitstatus_to_exitcode(status)
-    wall, cpu = time.perf_counter() - began, usage.ru_utime + usage.ru_stime
-    if process.returncode:
-        words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no message"]
-        ended = f"exit code {process.returncode}; its log: {log}"
-        raise InputError("failed", where=" ".join(command[:6]), got=words[-1], hint=ended)
-    others = max(0.0, (_busy_seconds() - busy - cpu) / wall)
-    return {"wall_s": round(wall, 3), "cpu_s": round(cpu, 3), "others": round(others, 2)}
-
-
-def _busy_seconds() -> float:
-    """Processor seconds that all cores of this machine have worked since it started."""
-    times = psutil.cpu_times()
-    return sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0)

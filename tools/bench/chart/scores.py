@@ -1,4 +1,4 @@
-"""All scores of one result of tools/bench/chart/command.py, as {dotted name: number}.
+"""All scores of one result of tools/bench/chart/bench.py, as {dotted name: number}.
 
 What tools.score compares beside maps, mesh, poses and light are pictures: re-renders of the clip's frames and of the
 head under lights that it did not see. Here one renderer makes them for all results, with visibility and bounces,
@@ -22,8 +22,7 @@ from shared.io.meshes import write_obj
 from shared.rendering.precomputed_transfer import Sizes
 from shared.rendering.views import HeadViews, ViewCamera
 from tools.relight.inputs import Asset, open_asset
-from tools.scoring.align import Similarity
-from tools.scoring.relighting import result_poses
+from tools.scoring.align import Similarity, result_poses
 from tools.scoring.score import camera_intrinsics, score
 
 SIZES = Sizes(directions=512, nodes=400)

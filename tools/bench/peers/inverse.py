@@ -1,5 +1,5 @@
 """Mitsuba 3's gradient-based inverse rendering of a tracked clip: the peer in the chart of
-tools/bench/chart/command.py.
+tools/bench/chart/bench.py.
 
     python -m tools.bench.peers.inverse SUBJECT RUN OUT --at 60 120
 
@@ -22,13 +22,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from shared.compute.run_context import SILENT
 from shared.contract.provenance import own_peak_bytes
 from shared.errors import InputError
 from shared.geometry.transforms import world_from_head
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.inverse.clip_inputs import read_inputs
-from shared.inverse.problem import FACE_SKIN, segment_vertices
+from shared.inverse.problem import FACE_SKIN
 from shared.inverse.published_clip import START_FRAMES, Start, average_texture, make_start
 from shared.io.arrays import save_arrays, write_json
 from shared.io.images import write_exr
@@ -55,15 +56,16 @@ class PeerSolver:
 
     def __init__(self, inputs, start: Start, samples: int, scale: float, depth: int):
         self.inputs, self.samples, self.iteration = inputs, samples, 0
-        width, height = (round(edge * scale) for edge in inputs.size)
+        self.views, mesh = inputs.views, inputs.surface.mesh
+        width, height = (round(edge * scale) for edge in self.views.size)
         self.size = width, height
-        lens = np.diag([width / inputs.size[0], height / inputs.size[1], 1.0]) @ inputs.intrinsics
-        self.turns = world_from_head(inputs.camera_from_head, inputs.moves)
+        lens = np.diag([width / self.views.size[0], height / self.views.size[1], 1.0]) @ inputs.lens
+        self.turns = world_from_head(self.views.camera_from_head, self.views.moves)
         self.mi = mitsuba.mitsuba()
         light = np.broadcast_to(np.asarray(start.radiance, np.float32), (LIGHT_HEIGHT, 2 * LIGHT_HEIGHT, 3))
-        camera = ViewCamera(inputs.camera_from_head[0], lens, self.size)
+        camera = ViewCamera(self.views.camera_from_head[0], lens, self.size)
         integrator = {"type": "prb", "max_depth": depth, "rr_depth": 1000, "hide_emitters": True}
-        self.scene = mitsuba.load_scene(inputs.mesh, light, camera, self._bsdf(start), integrator, samples)
+        self.scene = mitsuba.load_scene(mesh, light, camera, self._bsdf(start), integrator, samples)
         self.params = self.mi.traverse(self.scene)
         self.keys = {name: f"shape.bsdf.{name}.data" for name in RANGES}
         self.optimiser = self.mi.ad.Adam(lr=RATES["albedo"])
@@ -90,7 +92,7 @@ class PeerSolver:
     def picture(self, f: int) -> tuple:
         """Frame f at the solver's size: colours, weight of each pixel, and where the clip is overexposed."""
         if f not in self._pictures:
-            picture = self.inputs.picture(f)
+            picture = self.views.picture(f)
             colours = np.ascontiguousarray(picture.levels[0], np.float32)
             clipped = (colours >= CLIPPED).astype(np.float32)
             inside = (picture.inside > 0).astype(np.float32)
@@ -103,7 +105,7 @@ class PeerSolver:
     def render(self, f: int, seed: int):
         """Frame f with the present parameters; gradients pass."""
         mi, params = self.mi, self.params
-        params["sensor.to_world"] = mi.Transform4f(mitsuba.head_from_camera(self.inputs.camera_from_head[f]))
+        params["sensor.to_world"] = mi.Transform4f(mitsuba.head_from_camera(self.views.camera_from_head[f]))
         turn = np.eye(4)
         turn[:3, :3] = self.turns[f].T
         params["light.to_world"] = mi.Transform4f(turn)
@@ -117,7 +119,7 @@ class PeerSolver:
 
     def step(self) -> float:
         """One iteration on one frame -> its loss: weighted mean squared error, overexposed pixels one-sided."""
-        dr, frames = self.dr, len(self.inputs.camera_from_head)
+        dr, frames = self.dr, len(self.views.camera_from_head)
         f = int(np.random.default_rng(self.iteration // frames).permutation(frames)[self.iteration % frames])
         colours, weight, clipped = self.picture(f)
         error = self.render(f, self.iteration) - colours
@@ -169,10 +171,10 @@ def write_result(folder: Path, solver: PeerSolver, frame_index: np.ndarray, intr
         colour_space = "lin_rec709_scene" if name == "diffuse_albedo" else "data"
         write_exr(folder / "maps" / f"{name}.exr", np.ascontiguousarray(image), colour_space=colour_space)
     write_exr(folder / "envmap.exr", solver.light(), colour_space="lin_rec709_scene", latlong=True)
-    write_obj(folder / "mesh.obj", solver.inputs.mesh)
-    poses = solver.inputs.camera_from_head
+    write_obj(folder / "mesh.obj", solver.inputs.surface.mesh)
+    poses = solver.views.camera_from_head
     save_arrays(folder / "poses.npz", camera_from_head=poses, frame_index=frame_index, intrinsics=intrinsics)
-    write_json(folder / "solve.json", {"model": {"moves": solver.inputs.moves}, "iterations": solver.iteration})
+    write_json(folder / "solve.json", {"model": {"moves": solver.views.moves}, "iterations": solver.iteration})
 
 
 def descend(solver: PeerSolver, seconds: list[float], began: float, write) -> None:
@@ -203,10 +205,10 @@ def main(arguments: list[str] | None = None) -> int:
     os.environ.setdefault(mitsuba.VARIABLE, VARIANT)
     try:
         inputs = read_inputs(*(options.run / "work" / name for name in STAGES))
-        viewer = SurfaceViewer.of(inputs.mesh)
+        viewer = SurfaceViewer.of(inputs.surface.mesh)
         some = spread_frames(len(inputs.frame_index), START_FRAMES)
-        average = average_texture(inputs, viewer, MAP_SIZE, some, lambda items, label="": items)
-        start = make_start(average, segment_vertices(inputs, FACE_SKIN), WHITE_SIGMA, specular=True)
+        average = average_texture(inputs.views.take(some), viewer, MAP_SIZE, SILENT)
+        start = make_start(average, inputs.surface.vertices_of(FACE_SKIN), WHITE_SIGMA, specular=True)
         solver = PeerSolver(inputs, start, options.samples, options.scale, options.depth)
     except InputError as error:
         print(f"tools.bench.peers.inverse: {error}", file=sys.stderr)

@@ -1,6 +1,7 @@
 """The command: python -m tools.bench.stress"""
 
-from tools.bench.stress.command import main
+from tools.bench.runner import run
+from tools.bench.stress.bench import StressBench
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(StressBench, "tools.bench.stress"))

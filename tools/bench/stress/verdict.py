@@ -48,14 +48,15 @@ class Verdict:
     said: tuple[str, ...]
 
 
-def is_wrong(name: str, value: float, at_zero: float) -> bool:
-    """Whether a score's value (NaN too) is worse than its limit and than what the perturbation at 0 allows."""
-    return not value <= allowed(name, at_zero)
+def is_wrong(name: str, value: float | None, at_zero: float | None) -> bool:
+    """Whether a score's value (None: it is not finite) is worse than its limit and than what the perturbation at 0
+    allows."""
+    return value is None or not value <= allowed(name, at_zero)
 
 
-def allowed(name: str, at_zero: float) -> float:
+def allowed(name: str, at_zero: float | None) -> float:
     """The worst value of a score that still is right."""
-    return max(LIMITS[name].most, LIMITS[name].growth * at_zero)
+    return max(LIMITS[name].most, LIMITS[name].growth * (at_zero or 0.0))
 
 
 def judge(says: str, row: Mapping, zero: Mapping) -> Verdict:

@@ -1,10 +1,9 @@
-"""The benchmark's change of head frame."""
+"""The change of head frame between a result and the truth."""
 
 import numpy as np
 
 from shared.geometry.transforms import rigid, rotation_from_vector
-from tools.scoring.align import Similarity
-from tools.scoring.relighting import result_poses
+from tools.scoring.align import Similarity, result_poses
 
 
 def test_poses_of_the_result_show_the_same_directions():
