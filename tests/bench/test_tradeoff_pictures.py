@@ -1,7 +1,6 @@
 """The chart of speed against accuracy: its picture and its page."""
 
-import pytest
-from browser import Browser, chromium
+from browser import needs_browser, visit
 from toy_tradeoff import ERROR, POINTS
 
 from tools.bench.chart.cases import GROUPS
@@ -24,12 +23,12 @@ def test_the_picture_names_the_presets_and_the_front():
     assert "http" not in svg.replace('xmlns="http://www.w3.org/2000/svg"', "")
 
 
-@pytest.mark.skipif(chromium() is None, reason="needs Chromium on the path or in LIMN_CHROMIUM")
+@needs_browser
 def test_the_page_answers(tmp_path):
     path = tmp_path / "chart.html"
     path.write_text(tradeoff_page(POINTS, ERROR, "a </script> clip", GROUPS), encoding="utf-8")
-    with Browser(1000, 900) as page:
-        page.open(path)
+    with visit(path) as visited:
+        page = visited.page
         assert page.evaluate("document.querySelectorAll('#chart circle').length") == len(POINTS)
         front = "[...document.querySelectorAll('#rows tr.front td:first-child')].map(c => c.textContent).join()"
         assert page.evaluate(front) == "draft, matte,draft,standard"
@@ -40,4 +39,4 @@ def test_the_page_answers(tmp_path):
         assert page.evaluate("document.getElementById('about').textContent").startswith(chosen)
         page.click("#groups input")
         assert page.evaluate("document.querySelectorAll('#chart circle').length") == len(POINTS) - 3
-        assert page.problems == [] and page.requests == [path.resolve().as_uri()]
+        assert visited.problems == [] and visited.requests == [path.resolve().as_uri()]
