@@ -159,8 +159,8 @@ def test_page_of_a_run_and_of_what_lies_there(tmp_path, capsys):
     assert set(rows_of(text)) == {"done", "not-run", "input-error"}
 
 
-def test_a_place_that_cannot_be_written_loses_no_summary(tmp_path):
-    pipeline, subject = copy_pipeline(tmp_path / "toy"), make_subject(tmp_path / "anna")
+def test_a_place_that_cannot_be_written_loses_no_summary(pipeline, tmp_path):
+    subject = make_subject(tmp_path / "anna")
     (tmp_path / "all.html").mkdir()
     code, output = limn("run", subject, "--pipeline", pipeline, "--summary", tmp_path / "all.json")
     assert code == 2 and "the overview cannot be written" in output

@@ -6,18 +6,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
-from toy_runs import REPOSITORY, copy_pipeline, limn, limn_process, make_subject, outputs_of, tree
+from toy_runs import REPOSITORY, copy_pipeline, limn, limn_process, make_subject, outputs_of, tree, wait_for
 
 from tools.limn import main
-
-
-@pytest.fixture
-def pipeline(tmp_path):
-    return copy_pipeline(tmp_path / "toy")
 
 
 @pytest.fixture
@@ -40,14 +34,6 @@ def states(pipeline, subject, capsys):
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A subject after one run with the untouched pipeline, and what limn printed. For copying only."""
-    folder = tmp_path_factory.mktemp("finished")
-    pipeline, subject = copy_pipeline(folder / "toy"), make_subject(folder / "anna")
-    return subject, *limn("run", subject, "--pipeline", pipeline)
-
-
-@pytest.fixture(scope="module")
 def reference(tmp_path_factory):
     """{file: bytes} that an undisturbed run publishes, computed stage by stage without the workflow."""
     folder = tmp_path_factory.mktemp("reference")
@@ -57,13 +43,6 @@ def reference(tmp_path_factory):
         path = os.pathsep.join([str(pipeline.parent), str(REPOSITORY)])
         subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, check=True, capture_output=True)
     return outputs_of(subject)
-
-
-def wait_for(condition, seconds=120.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 def is_alive(pid):
@@ -79,10 +58,10 @@ def edit(path, old, new):
     path.write_text(text.replace(old, new))
 
 
-def test_only_what_changed_runs_again(pipeline, subject, states, finished):
+def test_only_what_changed_runs_again(pipeline, subject, states, toy_run):
     assert states() == {name: ("will run", "never ran")
                         for name in ("read_text", "count_words", "draw_bars", "export_page")}
-    made, code, output = finished
+    made, code, output = toy_run
     assert code == 0 and output.count(" done in ") == 5 and str(made / "export" / "report.html") in output
     shutil.copytree(made, subject, dirs_exist_ok=True, copy_function=shutil.copyfile)
     first = outputs_of(subject)
@@ -113,8 +92,8 @@ def test_only_what_changed_runs_again(pipeline, subject, states, finished):
     assert changed == {"work/count_words/manifest.json"}
 
 
-def test_damage_is_seen_and_mended(pipeline, subject, states, finished):
-    shutil.copytree(finished[0], subject, dirs_exist_ok=True)
+def test_damage_is_seen_and_mended(pipeline, subject, states, toy_run):
+    shutil.copytree(toy_run[0], subject, dirs_exist_ok=True)
     first = outputs_of(subject)
     (subject / "export" / "page.txt").unlink()
     edit(subject / "work" / "count_words" / "words.json", "rose", "nose")
