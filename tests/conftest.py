@@ -31,6 +31,16 @@ def tiny_run(tmp_path_factory, worker_id):
     return folder / TINY_SUBJECT.name
 
 
+@pytest.fixture(scope="session")
+def toy_run(tmp_path_factory):
+    """A subject after one run of the untouched toy pipeline, limn's exit code and what it said. For copying only."""
+    from toy_runs import copy_pipeline, limn, make_subject
+
+    folder = tmp_path_factory.mktemp("toy_run")
+    pipeline, subject = copy_pipeline(folder / "toy"), make_subject(folder / "anna")
+    return subject, *limn("run", subject, "--pipeline", pipeline)
+
+
 @atexit.register
 def forget_leaks_of_openimageio():
     """Its binding lists its own leaks on stderr when Python ends, after the test runner's closing line."""

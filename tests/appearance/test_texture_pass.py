@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from shapes import grid_plane
+from shapes import grid_plane, turned
 
 from shared.appearance.maps import make_maps
 from shared.appearance.texture_pass import TexturePass
 from shared.geometry.mesh import interpolate
 from shared.geometry.raycast import RayScene, camera_hits
-from shared.geometry.transforms import rigid, rotation_from_vector
 from shared.imaging.image_sampling import SurfaceViewer, prepare_picture
 from shared.imaging.texels import TexelSurface
 from shared.imaging.texture import sample_bilinear
@@ -72,8 +71,7 @@ def plate_views(mesh, shading, clip_at=np.inf):
     """Pictures of the plate swinging +-12 degrees; its right fifth is behind the mask's border in all frames."""
     scene = RayScene(mesh.vertices, mesh.faces)
     swing = np.radians(12.0) * np.sin(np.arange(FRAMES))
-    rotation = np.diag([1.0, -1, -1]) @ rotation_from_vector(swing[:, None] * [0.4, 0.9, 0.0])
-    poses = rigid(rotation, np.tile([0.0, 0, 500.0], (FRAMES, 1)))
+    poses = turned(swing[:, None] * [0.4, 0.9, 0.0], (0.0, 0.0, 500.0))
     pictures = []
     for f in range(FRAMES):
         face, bary, _ = camera_hits(scene, poses[f], LENS, *SIZE)

@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import pytest
-from toy_runs import REPOSITORY, copy_pipeline, limn, make_subject, tree
+from toy_runs import REPOSITORY, tree
 
 from shared.contract.hashing import hash_file
 from shared.contract.sums import SUMS, read_sums
@@ -14,13 +14,10 @@ from shared.errors import InputError
 from tools.limn import main
 
 
-@pytest.fixture(scope="module")
-def published(tmp_path_factory):
+@pytest.fixture
+def published(toy_run):
     """A finished toy run's folder."""
-    folder = tmp_path_factory.mktemp("published")
-    subject = make_subject(folder / "anna")
-    assert limn("run", subject, "--pipeline", copy_pipeline(folder / "toy"))[0] == 0
-    return subject
+    return toy_run[0]
 
 
 @pytest.fixture

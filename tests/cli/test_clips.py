@@ -26,11 +26,6 @@ def make_pair(folder, settings=CLIPS + "camera: {focal_length_px: 900}\n"):
     return folder
 
 
-@pytest.fixture
-def pipeline(tmp_path):
-    return copy_pipeline(tmp_path / "toy")
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A subject of two clips after one run, the pipeline, and what limn said. For reading only."""

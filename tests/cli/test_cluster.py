@@ -23,21 +23,15 @@ def after(words, flag):
     return [words[i + 1] for i, word in enumerate(words) if word == flag]
 
 
-def test_grid_engine_counts_memory_for_each_slot():
-    words = command("sge", 4, 3001, 90, "/here/x.log")
-    assert after(words, "-pe") == ["smp"] and words[words.index("smp") + 1] == "4"
-    assert after(words, "-l") == ["h_vmem=751M", "h_rt=5400"] and after(words, "-o") == ["/here/x.log"]
-
-
-def test_lsf_gets_its_units():
-    words = command("lsf", 2, 1500, 90, "/here/x.log")
-    assert after(words, "-M") == ["1500MB"] and after(words, "-W") == ["90"]
-    assert after(words, "-R") == ["span[hosts=1] rusage[mem=1500MB]"] and after(words, "-oo") == ["/here/x.log"]
-
-
-def test_pbs_gets_seconds_and_one_chunk():
-    words = command("pbs", 2, 1500, 90, "/here/x.log")
-    assert after(words, "-l") == ["select=1:ncpus=2:mem=1500mb", "walltime=5400"]
+@pytest.mark.parametrize("scheduler, cores, memory_mb, wanted", [
+    ("sge", 4, 3001, {"-pe": ["smp"], "smp": ["4"], "-l": ["h_vmem=751M", "h_rt=5400"], "-o": ["/here/x.log"]}),
+    ("lsf", 2, 1500, {"-M": ["1500MB"], "-W": ["90"], "-R": ["span[hosts=1] rusage[mem=1500MB]"],
+                      "-oo": ["/here/x.log"]}),
+    ("pbs", 2, 1500, {"-l": ["select=1:ncpus=2:mem=1500mb", "walltime=5400"]})])
+def test_each_scheduler_gets_its_units(scheduler, cores, memory_mb, wanted):
+    """Grid Engine counts memory for each slot, PBS wants seconds and one chunk."""
+    words = command(scheduler, cores, memory_mb, 90, "/here/x.log")
+    assert {flag: after(words, flag) for flag in wanted} == wanted
 
 
 @pytest.fixture

@@ -3,12 +3,12 @@
 import json
 import os
 import re
+import shutil
 import signal
-import time
 from pathlib import Path
 
 import pytest
-from toy_runs import CURRENT_STAGES, copy_pipeline, limn, limn_process, make_subject, tree
+from toy_runs import CURRENT_STAGES, limn, limn_process, make_subject, tree, wait_for
 
 from shared.contract import launch
 from shared.contract.needs import WorkSize, amount, measured_scale, parse_needs
@@ -17,11 +17,6 @@ from shared.errors import InputError
 from tools.cli.cases import find_subjects
 from tools.cli.resources import memory_to_give, requested
 from tools.limn import main
-
-
-@pytest.fixture
-def pipeline(tmp_path):
-    return copy_pipeline(tmp_path / "toy")
 
 
 @pytest.fixture
@@ -66,17 +61,19 @@ def test_list_of_subjects(tmp_path, batch):
 
 def test_status_shows_a_running_stage(pipeline, tmp_path, capsys):
     subject = make_subject(tmp_path / "anna")
-    process = limn_process("run", subject, "--pipeline", pipeline, "--set", "count_words.pause_s=30")
-    arguments = ["status", str(subject), "--pipeline", str(pipeline), "--set", "count_words.pause_s=30"]
-    deadline, text = time.monotonic() + 60, ""
-    while "pause" not in text and time.monotonic() < deadline:
-        time.sleep(0.2)
+    process = limn_process("run", subject, "--pipeline", pipeline, TOY_PAUSE_S="300")
+    arguments = ["status", str(subject), "--pipeline", str(pipeline)]
+
+    def told():
         assert main(arguments) == 0
         text = capsys.readouterr().out
+        return "pause" in text and text
+
+    text = wait_for(told)
     process.send_signal(signal.SIGTERM)
     process.communicate(timeout=120)
     assert "a run works on it" in text and re.search(r"count_words +running", text)
-    assert re.search(r"since \d+ s: pause \d+/300", text)
+    assert re.search(r"since \d+ s: pause \d+/3000", text)
     assert main(arguments) == 0
     assert not re.search(r"a run works on it|count_words +running", capsys.readouterr().out)
 
@@ -214,9 +211,8 @@ def test_too_little_space_is_told_before_a_stage_starts(pipeline, tmp_path, caps
     assert tree(subject) == ["clip.txt", "subject.yaml"]
 
 
-def test_a_flipped_bit_is_noticed_before_use(pipeline, tmp_path):
-    subject = make_subject(tmp_path / "anna")
-    assert limn("run", subject, "--pipeline", pipeline)[0] == 0
+def test_a_flipped_bit_is_noticed_before_use(pipeline, tmp_path, toy_run):
+    subject = shutil.copytree(toy_run[0], tmp_path / "anna")
     page = (subject / "export" / "page.txt").read_bytes()
     bars = subject / "work" / "draw_bars" / "bars.txt"
     flip(bars)

@@ -8,7 +8,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from browser import Browser, chromium
+from browser import needs_browser, visit
 from toy_result import FRAMES, RENDERED, ToyJob, write_toy_work
 from toy_runs import copy_pipeline, limn, make_subject, tree
 
@@ -159,8 +159,8 @@ def test_page_of_a_run_and_of_what_lies_there(tmp_path, capsys):
     assert set(rows_of(text)) == {"done", "not-run", "input-error"}
 
 
-def test_a_place_that_cannot_be_written_loses_no_summary(tmp_path):
-    pipeline, subject = copy_pipeline(tmp_path / "toy"), make_subject(tmp_path / "anna")
+def test_a_place_that_cannot_be_written_loses_no_summary(pipeline, tmp_path):
+    subject = make_subject(tmp_path / "anna")
     (tmp_path / "all.html").mkdir()
     code, output = limn("run", subject, "--pipeline", pipeline, "--summary", tmp_path / "all.json")
     assert code == 2 and "the overview cannot be written" in output
@@ -172,12 +172,12 @@ def test_page_never_takes_the_summary_s_name(tmp_path):
         "summary.html", "a.html.html", "a.html"]
 
 
-@pytest.mark.skipif(chromium() is None, reason="needs chromium on the path, or LIMN_CHROMIUM, to run the page's script")
+@needs_browser
 def test_headings_sort_and_the_field_filters(page):
-    with Browser(1280, 900) as browser:
-        browser.open(page)
+    with visit(page) as visited:
+        browser = visited.page
         names = "[...document.querySelectorAll('#rows tr:not([hidden])')].map(row => row.className)"
-        browser.wait_for("document.querySelectorAll('th button').length > 5")
+        browser.wait_for_function("document.querySelectorAll('th button').length > 5")
         click = "[...document.querySelectorAll('th button')].find(b => b.textContent.startsWith('{}')).click()"
         browser.evaluate(click.format("minutes"))
         assert browser.evaluate(names)[-2:] == ["review", "done"]
@@ -185,7 +185,6 @@ def test_headings_sort_and_the_field_filters(page):
         assert browser.evaluate(names)[:2] == ["done", "review"]
         browser.evaluate(click.format("coverage"))
         assert set(browser.evaluate(names)[:2]) == {"done", "review"}
-        browser.evaluate("const f = document.getElementById('filter'); f.value = 'BOLD';"
-                         "f.dispatchEvent(new Event('input'))")
-        assert browser.evaluate(names) == ["done"] and browser.problems == []
+        browser.fill("#filter", "BOLD")
+        assert browser.evaluate(names) == ["done"] and visited.problems == []
         assert browser.evaluate("[...document.images].every(image => image.naturalWidth > 0)")

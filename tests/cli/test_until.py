@@ -3,16 +3,11 @@
 import json
 
 import pytest
-from toy_runs import copy_pipeline, limn, make_subject, outputs_of, tree
+from toy_runs import limn, make_subject, outputs_of, tree
 
 from tools.limn import main
 
 CLIPS = "clips:\n  sun: {video: clip.txt}\n  lamp: {video: lamp.txt}\n"
-
-
-@pytest.fixture
-def pipeline(tmp_path):
-    return copy_pipeline(tmp_path / "toy")
 
 
 def stages_of(folder):

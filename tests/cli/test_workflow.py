@@ -6,18 +6,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
-from toy_runs import REPOSITORY, copy_pipeline, limn, limn_process, make_subject, outputs_of, tree
+from toy_runs import REPOSITORY, copy_pipeline, limn, limn_process, make_subject, outputs_of, tree, wait_for
 
 from tools.limn import main
-
-
-@pytest.fixture
-def pipeline(tmp_path):
-    return copy_pipeline(tmp_path / "toy")
 
 
 @pytest.fixture
@@ -40,31 +34,15 @@ def states(pipeline, subject, capsys):
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A subject after one run with the untouched pipeline, and what limn printed. For copying only."""
-    folder = tmp_path_factory.mktemp("finished")
-    pipeline, subject = copy_pipeline(folder / "toy"), make_subject(folder / "anna")
-    return subject, *limn("run", subject, "--pipeline", pipeline)
-
-
-@pytest.fixture(scope="module")
 def reference(tmp_path_factory):
     """{file: bytes} that an undisturbed run publishes, computed stage by stage without the workflow."""
     folder = tmp_path_factory.mktemp("reference")
     pipeline, subject = copy_pipeline(folder / "toy"), make_subject(folder / "anna")
     for name in ("read_text", "count_words", "draw_bars", "export_page"):
-        settings = ["--set", "pause_s=1"] if name == "count_words" else []
-        command = [sys.executable, "-m", f"toy.{name}", "--subject", subject, "--pipeline", pipeline, *settings]
+        command = [sys.executable, "-m", f"toy.{name}", "--subject", subject, "--pipeline", pipeline]
         path = os.pathsep.join([str(pipeline.parent), str(REPOSITORY)])
         subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, check=True, capture_output=True)
     return outputs_of(subject)
-
-
-def wait_for(condition, seconds=120.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 def is_alive(pid):
@@ -80,17 +58,17 @@ def edit(path, old, new):
     path.write_text(text.replace(old, new))
 
 
-def test_only_what_changed_runs_again(pipeline, subject, states, finished):
+def test_only_what_changed_runs_again(pipeline, subject, states, toy_run):
     assert states() == {name: ("will run", "never ran")
                         for name in ("read_text", "count_words", "draw_bars", "export_page")}
-    made, code, output = finished
+    made, code, output = toy_run
     assert code == 0 and output.count(" done in ") == 5 and str(made / "export" / "report.html") in output
     shutil.copytree(made, subject, dirs_exist_ok=True, copy_function=shutil.copyfile)
     first = outputs_of(subject)
 
     code, output = limn("run", subject, "--pipeline", pipeline, TOY_PID=str(subject.parent / "pid"))
     assert code == 0 and "nothing to do" in output and " done in " not in output
-    assert not (subject.parent / "pid").exists()  # no stage was started to find that out
+    assert not (subject.parent / "pid").exists()  # count_words was not started to find that out
 
     for name in ("clip.txt", "subject.yaml", "work/read_text/text.txt"):
         (subject / name).touch()
@@ -101,7 +79,7 @@ def test_only_what_changed_runs_again(pipeline, subject, states, finished):
     assert planned.pop("export_page") == ("will run", 'parameter title: "Words" -> "Roses"')
     assert [state for state, _ in planned.values()] == ["current"] * 3
 
-    # A changed stage runs; what follows starts only because it might have changed, and answers at once.
+    # A changed stage runs; what follows might have changed, and turns out current.
     edit(pipeline.parent / "toy" / "count_words.py", "version=1", "version=2")
     planned = states()
     assert planned["count_words"] == ("will run", "stage version 1 -> 2") and planned["read_text"][0] == "current"
@@ -114,8 +92,8 @@ def test_only_what_changed_runs_again(pipeline, subject, states, finished):
     assert changed == {"work/count_words/manifest.json"}
 
 
-def test_damage_is_seen_and_mended(pipeline, subject, states, finished):
-    shutil.copytree(finished[0], subject, dirs_exist_ok=True)
+def test_damage_is_seen_and_mended(pipeline, subject, states, toy_run):
+    shutil.copytree(toy_run[0], subject, dirs_exist_ok=True)
     first = outputs_of(subject)
     (subject / "export" / "page.txt").unlink()
     edit(subject / "work" / "count_words" / "words.json", "rose", "nose")
@@ -133,12 +111,12 @@ def test_damage_is_seen_and_mended(pipeline, subject, states, finished):
 
 @pytest.mark.parametrize("victim", ["limn", "stage"])
 def test_killed_in_the_middle(pipeline, subject, tmp_path, reference, victim):
+    """Killed while half a result lies in count_words' folder, in a pause that outlasts the test."""
     pid_file = tmp_path / "pid"
-    arguments = ("run", subject, "--pipeline", pipeline, "--set", "count_words.pause_s=1", "--cores", "1")
-    process = limn_process(*arguments, TOY_PID=str(pid_file))
+    arguments = ("run", subject, "--pipeline", pipeline, "--cores", "1")
+    process = limn_process(*arguments, TOY_PID=str(pid_file), TOY_PAUSE_S="300")
     wait_for(lambda: pid_file.is_file() and pid_file.read_text())
     stage = int(pid_file.read_text())
-    time.sleep(0.3)
     os.kill(process.pid if victim == "limn" else stage, signal.SIGKILL)
     output, _ = process.communicate(timeout=120)
     wait_for(lambda: not is_alive(stage))

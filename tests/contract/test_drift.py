@@ -17,21 +17,11 @@ from tools.limn import main as limn_main
 OLD_NUMPY = "1.0.0"
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A pipeline and a subject after one run. For copying only."""
-    folder = tmp_path_factory.mktemp("finished")
-    pipeline, subject = copy_pipeline(folder / "toy"), make_subject(folder / "anna")
-    code, output = limn("run", subject, "--pipeline", pipeline)
-    assert code == 0, output
-    return pipeline, subject
-
-
 @pytest.fixture
-def case(finished, tmp_path):
+def case(toy_run, tmp_path):
     """A copy of its own: the pipeline and the subject."""
     pipeline = copy_pipeline(tmp_path / "toy")
-    shutil.copytree(finished[1], tmp_path / "anna")
+    shutil.copytree(toy_run[0], tmp_path / "anna")
     return pipeline, tmp_path / "anna"
 
 

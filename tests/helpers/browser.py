@@ -1,20 +1,21 @@
-"""A headless Chromium for the tests, driven over its debugging pipe: no library, no port, no network."""
+"""A page in a headless Chromium, by Playwright, for the tests of what a page's script does."""
 
 from __future__ import annotations
 
-import base64
-import json
+import importlib.util
 import os
-import select
 import shutil
-import subprocess
-import tempfile
-import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
-FLAGS = ("--headless --no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-background-networking "
-         "--disable-component-update --disable-sync --no-first-run --hide-scrollbars --remote-debugging-pipe").split()
-TIME_LIMIT_S = 90.0
+import pytest
+
+FLAGS = "--enable-unsafe-swiftshader --disable-background-networking --disable-component-update --disable-sync".split()
+TIME_LIMIT_MS = 90_000
+DESKTOP, PHONE = (1280, 900), (390, 844)
+"""Windows, in pixels."""
 
 
 def chromium() -> str | None:
@@ -23,133 +24,55 @@ def chromium() -> str | None:
     return next((found for found in map(shutil.which, filter(None, names)) if found), None)
 
 
-class Browser:
-    """One page. problems: what the console or the page complained of; requests: every address that was asked for."""
+MISSING = [
+    *(["the package playwright (requirements-browser.lock)"] if not importlib.util.find_spec("playwright") else []),
+    *(["Chromium on the path or in LIMN_CHROMIUM"] if chromium() is None else []),
+]
+needs_browser = pytest.mark.skipif(bool(MISSING), reason=f"needs {' and '.join(MISSING)}; make test-all installs it")
 
-    def __init__(self, width: int, height: int, mobile: bool = False):
-        self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
-        to_browser, ours = os.pipe()
-        theirs, from_browser = os.pipe()
-        self._write, self._read = ours, theirs
-        self._process = self._start([to_browser, from_browser])
-        self._buffer, self._id, self._events = b"", 0, []
-        self.problems: list[str] = []
-        self.requests: list[str] = []
-        self._session: str | None = None
-        target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
-        for domain in ("Page", "Runtime", "Log", "Network"):
-            self.call(f"{domain}.enable")
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, mobile=mobile, deviceScaleFactor=1)
 
-    def _start(self, ends: list[int]) -> subprocess.Popen:
-        """Chromium reads commands from descriptor 3 and answers on 4."""
-        def place() -> None:
-            high = [os.dup2(end, 90 + k) for k, end in enumerate(ends)]
-            for k, end in enumerate(high):
-                os.dup2(end, 3 + k)
+@dataclass
+class Visit:
+    """An open page (playwright.sync_api.Page). problems: what its console or its script complained of; requests: every
+    address that it asked for."""
 
-        command = [chromium(), *FLAGS, f"--user-data-dir={self._profile.name}", "about:blank"]
-        silent = subprocess.DEVNULL
-        process = subprocess.Popen(command, preexec_fn=place, close_fds=False, stdout=silent, stderr=silent)
-        for end in ends:
-            os.close(end)
-        return process
+    page: object
+    problems: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
 
-    def __enter__(self) -> Browser:
-        return self
+    def __post_init__(self) -> None:
+        self.page.on("console", lambda said: _is_complaint(said) and self.problems.append(said.text))
+        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
 
-    def __exit__(self, *_) -> None:
-        for end in (self._write, self._read):
-            os.close(end)
-        self._process.kill()
-        self._process.wait()
-        self._profile.cleanup()
+    def drag(self, selector: str, x: float, y: float = 0.0, start: tuple[float, float] = (0.0, 0.0)) -> None:
+        """The pointer goes down at the middle of the element plus `start`, moves by (x, y) px, and goes up."""
+        self.page.evaluate("selector => document.querySelector(selector).scrollIntoView({block: 'center', "
+                           "behavior: 'instant'})", selector)
+        box = self.page.locator(selector).bounding_box()
+        middle = box["x"] + box["width"] / 2 + start[0], box["y"] + box["height"] / 2 + start[1]
+        self.page.mouse.move(*middle)
+        self.page.mouse.down()
+        self.page.mouse.move(middle[0] + x, middle[1] + y)
+        self.page.mouse.up()
 
-    def call(self, method: str, **params) -> dict:
-        """One command of the DevTools protocol -> its result. RuntimeError when it fails or takes too long."""
-        self._id += 1
-        message = {"id": self._id, "method": method, "params": params}
-        if self._session:
-            message["sessionId"] = self._session
-        os.write(self._write, json.dumps(message).encode() + b"\0")
-        end = time.monotonic() + TIME_LIMIT_S
-        while True:
-            answer = self._receive(end - time.monotonic())
-            if answer.get("id") == self._id:
-                if "error" in answer:
-                    raise RuntimeError(f"{method}: {answer['error']}")
-                return answer["result"]
 
-    def _receive(self, seconds: float) -> dict:
-        while b"\0" not in self._buffer:
-            if not select.select([self._read], [], [], max(seconds, 0.0))[0]:
-                raise RuntimeError("the browser does not answer")
-            self._buffer += os.read(self._read, 1 << 20)
-        line, _, self._buffer = self._buffer.partition(b"\0")
-        message = json.loads(line)
-        self._note(message)
-        return message
+def _is_complaint(said) -> bool:
+    """Whether a message of the console is one; what the graphics driver remarks on its own speed is none."""
+    return said.type in ("error", "warning", "assert") and "GL Driver Message (OpenGL, Performance" not in said.text
 
-    def _note(self, message: dict) -> None:
-        method, params = message.get("method"), message.get("params", {})
-        self._events.append(method)
-        if method == "Network.requestWillBeSent":
-            self.requests.append(params["request"]["url"])
-        elif method == "Runtime.exceptionThrown":
-            self.problems.append(str(params["exceptionDetails"].get("exception", params)))
-        elif method == "Runtime.consoleAPICalled" and params["type"] in ("error", "warning", "assert"):
-            self.problems.append(str(params["args"]))
-        elif method == "Log.entryAdded" and params["entry"]["level"] == "error":
-            self.problems.append(params["entry"]["text"])
 
-    def open(self, path: Path) -> None:
-        """Loads a file and waits until it has fired its load event."""
-        self._events.clear()
-        self.call("Page.navigate", url=path.resolve().as_uri())
-        end = time.monotonic() + TIME_LIMIT_S
-        while "Page.loadEventFired" not in self._events:
-            self._receive(end - time.monotonic())
+@contextmanager
+def visit(path: Path, window: tuple[int, int] = DESKTOP) -> Iterator[Visit]:
+    """The page of a file, loaded. A phone's window comes with a phone's way to lay pages out."""
+    from playwright.sync_api import sync_playwright
 
-    def evaluate(self, script: str):
-        """The value of a JavaScript expression; promises are awaited."""
-        result = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
-        if "exceptionDetails" in result:
-            raise RuntimeError(f"{script}: {result['exceptionDetails']}")
-        return result["result"].get("value")
-
-    def wait_for(self, script: str) -> None:
-        """Until the expression is true."""
-        end = time.monotonic() + TIME_LIMIT_S
-        while not self.evaluate(script):
-            if time.monotonic() > end:
-                raise RuntimeError(f"never true: {script}")
-            time.sleep(0.05)
-
-    def drag(self, start: tuple[float, float], stop: tuple[float, float]) -> None:
-        """Pointer down at start, across to stop, up; positions in the window."""
-        for kind, (x, y) in (("mousePressed", start), ("mouseMoved", stop), ("mouseReleased", stop)):
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
-
-    def click(self, selector: str) -> None:
-        """A click in the middle of the element, scrolled into view."""
-        x, y = self.middle(selector)
-        self.drag((x, y), (x, y))
-
-    def middle(self, selector: str) -> tuple[float, float]:
-        """Where the element's middle lies in the window after it was scrolled into view."""
-        box = self.evaluate(
-            f"(() => {{ const e = document.querySelector({json.dumps(selector)}); e.scrollIntoView({{block: 'center', "
-            "behavior: 'instant'}); const r = e.getBoundingClientRect(); "
-            "return [r.x + r.width / 2, r.y + r.height / 2]; })()"
-        )
-        return box[0], box[1]
-
-    def screenshot(self, path: Path, whole: bool = True) -> None:
-        """The page, or the window, as a PNG."""
-        data = self.call("Page.captureScreenshot", captureBeyondViewport=whole, format="png")["data"]
-        path.write_bytes(base64.b64decode(data))
-
-    def emulate(self, media: str) -> None:
-        """Styles for "print" or "screen"."""
-        self.call("Emulation.setEmulatedMedia", media=media)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium(), args=FLAGS)
+        size = {"width": window[0], "height": window[1]}
+        page = browser.new_page(viewport=size, is_mobile=window == PHONE)
+        page.set_default_timeout(TIME_LIMIT_MS)
+        visited = Visit(page)
+        page.goto(path.resolve().as_uri())
+        yield visited
+        browser.close()

@@ -36,7 +36,11 @@ def grid_plane(count: int = 9, extent: float = 1.0) -> Mesh:
     return Mesh(vertices, faces, uvs, faces)
 
 
+def turned(vectors, place=(0.0, 0.0, 900.0)):
+    """[..., 4, 4]: a head that looks into the camera, turned by rotation vectors [..., 3], at `place` [..., 3] mm."""
+    return rigid(FACING @ rotation_from_vector(np.asarray(vectors)), np.asarray(place, np.float64))
+
+
 def nods(degrees, axis=(0.0, 1.0, 0.0), distance=900.0):
     """Poses before the camera, turned by these angles about an axis of the head."""
-    rotation = FACING @ rotation_from_vector(np.radians(degrees)[:, None] * np.array(axis))
-    return rigid(rotation, np.tile([0.0, 0, distance], (len(degrees), 1)))
+    return turned(np.radians(degrees)[:, None] * np.array(axis), (0.0, 0.0, distance))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from shapes import turned
 from toy_head import toy_head
 
 from shared.appearance.light_models import make_light_model
@@ -11,7 +12,7 @@ from shared.appearance.observations import Capture
 from shared.appearance.problem import AppearanceProblem, AppearanceSettings
 from shared.geometry.mesh import normalised
 from shared.geometry.raycast import RayScene
-from shared.geometry.transforms import camera_centres, fibonacci_sphere, rigid, rotation_from_vector, world_from_head
+from shared.geometry.transforms import camera_centres, fibonacci_sphere, world_from_head
 from shared.imaging.image_sampling import Samples
 from shared.rendering.brdf import hemispherical_albedo
 from shared.rendering.envmap import cube_directions
@@ -42,7 +43,7 @@ def swinging(frames=FRAMES, turn=0.6):
     """A head that turns 35 degrees (turn, in radians) to both sides and nods."""
     angle = np.linspace(0, 2 * np.pi, frames)
     vectors = turn * np.stack([0.4 * np.sin(2 * angle), np.sin(angle), 0 * angle], axis=1)
-    return rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors), np.tile([0, 0, 900.0], (frames, 1)))
+    return turned(vectors)
 
 
 def even_light(directions):

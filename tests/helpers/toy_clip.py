@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from shapes import turned
 from toy_head import toy_head
 
 from shared.geometry.surface import Surface
-from shared.geometry.transforms import rigid, rotation_from_vector
 from shared.imaging.color import encode_srgb
 from shared.imaging.image_sampling import prepare_picture
 from shared.imaging.views import Views
@@ -55,7 +55,7 @@ def toy_clip():
     mesh = toy_head(4).mesh(np.zeros(2), np.zeros(1))
     angle = np.linspace(-0.6, 0.6, FRAMES)
     vectors = np.stack([0.15 * np.sin(5 * angle), angle, 0 * angle], axis=1)
-    poses = rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors), np.tile([0.0, 0, 900.0], (FRAMES, 1)))
+    poses = turned(vectors)
     cameras = [ViewCamera(pose, LENS, SIZE) for pose in poses]
     views = HeadViews(mesh, true_maps(), Sizes(directions=512, nodes=60), cameras)
     light = latlong_from_cube(true_light(), 64)

@@ -7,10 +7,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-from shapes import sphere
+from shapes import sphere, turned
 
 from shared.contract.job import Parameters
-from shared.geometry.transforms import rigid, rotation_from_vector
 from shared.io.arrays import save_arrays, write_json
 from shared.io.images import write_exr, write_png
 from shared.io.meshes import save_mesh
@@ -33,8 +32,7 @@ def toy_poses(moves_by: float = 0.2) -> np.ndarray:
     """[F, 4, 4]: in front of the camera, y down there, turning from side to side and nodding a little."""
     turn = np.linspace(-moves_by, moves_by, len(FRAMES))
     vectors = np.stack([0.3 * turn, turn, 0.1 * turn], axis=1)
-    rotation = np.diag([1.0, -1.0, -1.0]) @ rotation_from_vector(vectors)
-    return rigid(rotation, np.array([4.0, -6.0, 600.0]) + np.outer(turn, [30.0, 5.0, -20.0]))
+    return turned(vectors, np.array([4.0, -6.0, 600.0]) + np.outer(turn, [30.0, 5.0, -20.0]))
 
 
 def toy_maps() -> dict[str, np.ndarray]:

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 from shared.contract import Output, Parameter, Stage
@@ -56,6 +57,15 @@ def limn(*arguments, **environment):
     process = limn_process(*arguments, **environment)
     output, _ = process.communicate(timeout=300)
     return process.returncode, output
+
+
+def wait_for(condition, seconds=120.0):
+    """What the condition gives once it is true; fails after so long."""
+    end = time.monotonic() + seconds
+    while not (found := condition()):
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+    return found
 
 
 def outputs_of(folder):

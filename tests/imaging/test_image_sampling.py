@@ -26,7 +26,7 @@ DISTANCE, FOCAL, SIZE = 5000.0, 20000.0, 640
 def seen_radius(viewer):
     """Farthest from the picture's middle that a vertex is seen, mm on the ball."""
     lens = np.array([[FOCAL, 0.0, SIZE / 2], [0.0, FOCAL, SIZE / 2], [0.0, 0.0, 1.0]])
-    view = viewer.view(rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, DISTANCE])), lens, (SIZE, SIZE))
+    view = viewer.view(rigid(FACING, np.array([0.0, 0.0, DISTANCE])), lens, (SIZE, SIZE))
     seen = view.weight > 0
     return np.linalg.norm(view.pixels[seen] - SIZE / 2, axis=1).max() * DISTANCE / FOCAL
 

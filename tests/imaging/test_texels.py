@@ -2,7 +2,7 @@
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from shapes import sphere
+from shapes import FACING, sphere
 
 from shared.appearance.texture import pooled_specular
 from shared.geometry.transforms import rigid
@@ -18,7 +18,7 @@ def seen_ball(size):
     rng = np.random.default_rng(1)
     codes = rng.integers(0, 256, (400, 400, 3)).astype(np.uint8)
     picture = prepare_picture(codes, codes.astype(np.float32) / 255, np.full((400, 400), 255, np.uint8))
-    surface, pose = TexelSurface(BALL, size), rigid(np.diag([1.0, -1, -1]), np.array([0.0, 0, 600]))
+    surface, pose = TexelSurface(BALL, size), rigid(FACING, np.array([0.0, 0, 600]))
     view = SurfaceViewer.of(BALL).view(pose, LENS, (400, 400))
     return surface, surface.frame_view(view, picture, LENS, BALL.vertices)
 

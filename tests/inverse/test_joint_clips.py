@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from field_check import field_faults
 from quick import QUICK, TINY
-from shapes import grid_plane
+from shapes import grid_plane, turned
 from toy_head import toy_head
 
 from shared.contract.records import RUN, SOLVE, SOLVED_POSES
@@ -32,8 +32,7 @@ MOVED = Similarity(1.07, rotation_from_vector(np.array([0.03, -0.05, 0.02])), np
 def swing(frames, widest):
     nod, turn = 0.1 * np.cos(np.arange(frames)), np.linspace(-widest, widest, frames)
     vectors = np.stack([nod, turn, np.zeros(frames)], axis=1)
-    turn = np.diag([1.0, -1.0, -1.0]) @ rotation_from_vector(vectors)
-    return rigid(turn, np.tile([5.0, 3.0, 700.0], (frames, 1)))
+    return turned(vectors, (5.0, 3.0, 700.0))
 
 
 def toy_clip(frames, widest, error_px, seed, second=False):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from shapes import grid_plane, sphere
+from shapes import FACING, grid_plane, sphere, turned
 
 from shared.geometry.mesh import vertex_normals
 from shared.geometry.raycast import RayScene
@@ -18,7 +18,7 @@ from shared.rendering.transfer import Points, bounce_nodes, irradiance, trace_tr
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 LENS, SIZE = np.array([[120.0, 0, 24], [0, 120.0, 20], [0, 0, 1]]), (48, 40)
-POSE = rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(np.array([0.1, 0.3, 0.05])), np.array([3.0, -5.0, 600.0]))
+POSE = turned([0.1, 0.3, 0.05], (3.0, -5.0, 600.0))
 DOUBLE = torch.float64
 
 
@@ -160,7 +160,7 @@ def test_a_surface_before_another_is_an_edge_too():
     mesh = wall.replace(vertices=vertices, faces=np.concatenate([wall.faces, plate.faces + len(wall.vertices)]))
     mesh = mesh.replace(face_uvs=np.zeros_like(mesh.faces))
     raster = Raster(mesh, LENS, SIZE)
-    pose = rigid(np.diag([1.0, -1, -1]), np.array([0.0, 0, 600.0]))
+    pose = rigid(FACING, np.array([0.0, 0, 600.0]))
     hits = raster.hits(RayScene(vertices, mesh.faces), pose)
     pairs = raster.pairs(vertices, pose, hits)
     on_ball = hits.face.ravel() >= len(wall.faces)

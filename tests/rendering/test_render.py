@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from shapes import grid_plane, sphere
+from shapes import FACING, grid_plane, sphere, turned
 
 from shared.geometry.raycast import RayScene
-from shared.geometry.transforms import fibonacci_sphere, rigid, rotation_from_vector
+from shared.geometry.transforms import fibonacci_sphere, rigid
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texture import sample_bilinear
 from shared.rendering.brdf import directional_albedo
@@ -16,7 +16,6 @@ from shared.rendering.transfer import bounce_nodes, mesh_points, trace_transfer
 RADIUS, DISTANCE, ROUGHNESS = 80.0, 600.0, 0.45
 LENS = np.array([[250.0, 0, 48], [0, 250.0, 40], [0, 0, 1]])
 SIZE = (96, 80)
-FACING = np.diag([1.0, -1.0, -1.0])
 RADIANCE = np.array([1.0, 2.0, 0.5])
 
 
@@ -27,8 +26,7 @@ def ball():
     scene, nodes, points = RayScene(mesh.vertices, mesh.faces), bounce_nodes(mesh, 40), mesh_points(mesh)
     directions = fibonacci_sphere(768)
     transfer, node_transfer = (trace_transfer(scene, some, nodes, directions) for some in (points, nodes.points))
-    rotation = FACING @ rotation_from_vector(np.array([[0.0, 0, 0], [0, 0.04, 0]]))
-    poses = rigid(rotation, np.array([[0.0, 0, DISTANCE], [30.0, -20.0, DISTANCE]]))
+    poses = turned([[0.0, 0, 0], [0, 0.04, 0]], [[0.0, 0, DISTANCE], [30.0, -20.0, DISTANCE]])
     shading = VertexShading(
         np.arange(len(points)),
         points.positions,

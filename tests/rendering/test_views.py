@@ -3,9 +3,9 @@
 import cv2
 import numpy as np
 import pytest
-from shapes import sphere
+from shapes import nods, sphere
 
-from shared.geometry.transforms import project, rigid, rotation_from_vector
+from shared.geometry.transforms import project, rotation_from_vector
 from shared.io.arrays import load_arrays, read_json
 from shared.io.images import read_exr
 from shared.io.meshes import load_mesh
@@ -112,9 +112,7 @@ def test_light_turns_with_the_head():
 
 
 def test_frontal_frame():
-    turns = np.radians([-30.0, -4.0, 12.0, 40.0])
-    rotation = np.diag([1.0, -1.0, -1.0]) @ rotation_from_vector(np.stack([0 * turns, turns, 0 * turns], axis=1))
-    assert frontal_frame(rigid(rotation, np.array([0.0, 0.0, 700.0]))) == 1
+    assert frontal_frame(nods([-30.0, -4.0, 12.0, 40.0])) == 1
 
 
 def test_studio_lights_are_usable():

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from browser import Browser, chromium
+from browser import DESKTOP, PHONE, needs_browser, visit
 from shapes import sphere
 from toy_result import FRAMES, ToyJob, toy_poses, write_toy_work
 
@@ -107,65 +107,55 @@ def test_data_of_the_slider(page):
     assert data["viewer"]["mesh"]["count"] == 3 * len(subdivide(sphere(levels=2)).faces)
 
 
-needs_browser = pytest.mark.skipif(
-    chromium() is None, reason="needs chromium on the path, or LIMN_CHROMIUM, to run the page's script"
-)
-SIZES = {"desktop": (1280, 900, False), "phone": (390, 844, True)}
-
-
-@pytest.fixture(scope="module", params=SIZES)
+@pytest.fixture(scope="module", params=[DESKTOP, PHONE], ids=["desktop", "phone"])
 def opened(request, page):
-    """The page, drawn, in a browser of either size."""
-    with Browser(*SIZES[request.param]) as browser:
-        browser.open(page)
-        browser.wait_for("document.getElementById('viewer').dataset.drawn === 'yes'")
-        yield browser
+    """A visit to the page, drawn, in a window of either size."""
+    with visit(page, request.param) as visited:
+        visited.page.wait_for_function("document.getElementById('viewer').dataset.drawn === 'yes'")
+        yield visited
 
 
-def canvas(browser):
+def canvas(opened):
     """What the 3D view shows."""
-    return browser.evaluate("document.getElementById('viewer').toDataURL()")
+    return opened.page.evaluate("document.getElementById('viewer').toDataURL()")
 
 
 @needs_browser
 def test_page_opens_without_a_complaint_or_a_request(opened, page):
     assert opened.problems == []
     assert {request for request in opened.requests if not request.startswith("data:")} == {page.resolve().as_uri()}
-    width, window = opened.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    width, window = opened.page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
     assert width <= window
-    assert opened.evaluate("[...document.querySelectorAll('figure img')].every(image => image.naturalWidth > 0)")
+    assert opened.page.evaluate("[...document.querySelectorAll('figure img')].every(image => image.naturalWidth > 0)")
 
 
 @needs_browser
 def test_slider_changes_the_frame(opened):
     shown = "[document.getElementById('frame-label').textContent, document.getElementById('frame-clip').src]"
-    label, clip = opened.evaluate(shown)
+    label, clip = opened.page.evaluate(shown)
     assert label.startswith("frame 8, 0.32 s, held out")
-    x, y = opened.middle("#frame")
-    width = opened.evaluate("document.getElementById('frame').getBoundingClientRect().width")
-    opened.drag((x, y), (x + 0.49 * width, y))
-    later, other = opened.evaluate(shown)
+    half = 0.49 * opened.page.locator("#frame").bounding_box()["width"]
+    opened.drag("#frame", half)
+    later, other = opened.page.evaluate(shown)
     assert later.startswith("frame 13") and other != clip
-    opened.drag((x + 0.49 * width, y), (x - 0.49 * width, y))
-    assert opened.evaluate(shown)[0].startswith("frame 3,")
+    opened.drag("#frame", -2 * half, start=(half, 0.0))
+    assert opened.page.evaluate(shown)[0].startswith("frame 3,")
 
 
 @needs_browser
 def test_view_turns_and_its_lamp_moves(opened):
     """Drag turns the head; with the lamp chosen it moves the lamp; each control changes the picture."""
     pictures = [canvas(opened)]
-    x, y = opened.middle("#viewer")
-    opened.drag((x, y), (x + 80, y + 20))
+    opened.drag("#viewer", 80, 20)
     pictures.append(canvas(opened))
-    opened.click("#viewer-moves-lamp")
-    x, y = opened.middle("#viewer")
-    opened.drag((x, y), (x - 120, y - 30))
+    opened.page.click("#viewer-moves-lamp")
+    opened.drag("#viewer", -120, -30)
     pictures.append(canvas(opened))
     for control, value in (("viewer-clip", 0.2), ("viewer-lamp", 3.0)):
-        opened.evaluate(f"(e => {{ e.value = {value}; e.dispatchEvent(new Event('input')); }})"
+        opened.page.evaluate(f"(e => {{ e.value = {value}; e.dispatchEvent(new Event('input')); }})"
                         f"(document.getElementById('{control}'))")
         pictures.append(canvas(opened))
-    opened.click("#viewer-plain")
+    opened.page.click("#viewer-plain")
     pictures.append(canvas(opened))
     assert len(set(pictures)) == len(pictures)
     assert opened.problems == []
@@ -174,23 +164,23 @@ def test_view_turns_and_its_lamp_moves(opened):
 @needs_browser
 def test_maps_enlarge(opened):
     state = "[document.getElementById('zoom').open, document.getElementById('zoom').className]"
-    opened.click("#maps .zoomable")
-    assert opened.evaluate(state) == [True, "fit"]
-    opened.click("#zoom img")
-    assert opened.evaluate(state) == [True, "close-up"]
-    opened.evaluate("document.querySelector('#zoom button').click()")
-    assert opened.evaluate(state)[0] is False
+    opened.page.click("#maps .zoomable")
+    assert opened.page.evaluate(state) == [True, "fit"]
+    opened.page.click("#zoom img")
+    assert opened.page.evaluate(state) == [True, "close-up"]
+    opened.page.click("#zoom button")
+    assert opened.page.evaluate(state)[0] is False
 
 
 @needs_browser
 def test_print_leaves_out_what_paper_cannot_do(opened):
-    opened.emulate("print")
+    opened.page.emulate_media(media="print")
     hidden = "getComputedStyle(document.querySelector('%s')).display === 'none'"
     try:
-        assert all(opened.evaluate(hidden % name) for name in ("nav", "#view", ".slider input", ".on-screen"))
-        assert not any(opened.evaluate(hidden % name) for name in ("#frames", "#maps", "#novel", "#warnings"))
+        assert all(opened.page.evaluate(hidden % name) for name in ("nav", "#view", ".slider input", ".on-screen"))
+        assert not any(opened.page.evaluate(hidden % name) for name in ("#frames", "#maps", "#novel", "#warnings"))
     finally:
-        opened.emulate("screen")
+        opened.page.emulate_media(media="screen")
 
 
 def test_error_colours():

@@ -41,48 +41,29 @@ def contents(folder):
             for path in sorted(folder.rglob("*"))}
 
 
-def link_clip(evil, victim):
-    (evil / "work" / "clips").mkdir(parents=True)
-    (evil / "work" / "clips" / "x").symlink_to(victim)
+def plant(evil, link, target):
+    """A link in the evil subject, at this place, to what lies there."""
+    (evil / link).parent.mkdir(parents=True, exist_ok=True)
+    (evil / link).symlink_to(target)
 
 
-def link_clips(evil, victim):
-    (evil / "work").mkdir()
-    (evil / "work" / "clips").symlink_to(victim.parent)
+LINKS = {"clip": ("work/clips/x", "victim"), "clips": ("work/clips", ""),
+         "work of clip": ("work/clips/x/work", "victim/work"),
+         "stage of clip": ("work/clips/x/work/read_text", "victim/work/read_text"),
+         "stage": ("work/read_text", "victim/work/read_text"), "export": ("export", "victim/export")}
 
 
-def link_work_of_clip(evil, victim):
-    (evil / "work" / "clips" / "x").mkdir(parents=True)
-    (evil / "work" / "clips" / "x" / "work").symlink_to(victim / "work")
-
-
-def link_stage_of_clip(evil, victim):
-    (evil / "work" / "clips" / "x" / "work").mkdir(parents=True)
-    (evil / "work" / "clips" / "x" / "work" / "read_text").symlink_to(victim / "work" / "read_text")
-
-
-def link_stage(evil, victim):
-    (evil / "work").mkdir()
-    (evil / "work" / "read_text").symlink_to(victim / "work" / "read_text")
-
-
-def link_export(evil, victim):
-    (evil / "export").symlink_to(victim / "export")
-
-
-LINKS = (link_clip, link_clips, link_work_of_clip, link_stage_of_clip, link_stage, link_export)
-
-
-@pytest.mark.parametrize("plant", LINKS, ids=lambda plant: plant.__name__)
-def test_no_command_reaches_through_links(tmp_path, tmp_path_factory, pipeline, capsys, monkeypatch, plant):
+@pytest.mark.parametrize("name", LINKS)
+def test_no_command_reaches_through_links(tmp_path, tmp_path_factory, pipeline, capsys, monkeypatch, name):
     monkeypatch.setenv("LIMN_TRUST", str(tmp_path / "toy"))
     victim = make_subject(tmp_path / "victim")
-    for name in ("read_text", "count_words"):
-        (victim / "work" / name).mkdir(parents=True)
-        (victim / "work" / name / "precious").write_text("keep me")
+    for stage in ("read_text", "count_words"):
+        (victim / "work" / stage).mkdir(parents=True)
+        (victim / "work" / stage / "precious").write_text("keep me")
     (victim / "export").mkdir()
     evil = make_subject(tmp_path / "evil")
-    plant(evil, victim)
+    link, target = LINKS[name]
+    plant(evil, link, tmp_path / target)
     page = tmp_path_factory.mktemp("pages") / "overview.html"
     before = contents(tmp_path)
     for command in COMMANDS:
@@ -126,10 +107,9 @@ def damaged(record, rng):
     return json.dumps(record).encode()
 
 
-def test_damaged_records_stop_no_command(tmp_path, pipeline, capsys, monkeypatch):
+def test_damaged_records_stop_no_command(tmp_path, pipeline, capsys, monkeypatch, toy_run):
     """In full: fifty times as many."""
-    subject = make_subject(tmp_path / "anna")
-    assert limn("run", subject, "--pipeline", pipeline, LIMN_TRUST=str(tmp_path / "toy"))[0] == 0
+    subject = shutil.copytree(toy_run[0], tmp_path / "anna")
     flags = [{"gate": "coverage", "value": 0.1, "limit": "0.5 or more"}]
     (subject / "work" / "quality.json").write_text(json.dumps({"gates": {}, "results": {}, "flags": flags}))
     sound = {path: path.read_bytes() for path in subject.rglob("*.json")}
@@ -156,21 +136,20 @@ def test_damaged_records_stop_no_command(tmp_path, pipeline, capsys, monkeypatch
             sound = now | {file: sound[file] for file in left}
 
 
-def test_hostile_subjects_stop_no_sound_one(tmp_path, pipeline):
+def test_hostile_subjects_stop_no_sound_one(tmp_path, pipeline, toy_run):
     batch = tmp_path / "batch"
     make_subject(batch / "sound")
-    make_subject(batch / "costly")
+    shutil.copytree(toy_run[0], batch / "costly")
     make_subject(batch / "summary.json")
     arguments = ("run", batch, "--pipeline", pipeline)
     trusted = {"LIMN_TRUST": str(tmp_path / "toy")}
-    assert limn("run", batch / "costly", "--pipeline", pipeline, **trusted)[0] == 0
     for path in (batch / "costly").rglob("provenance.json"):
         path.write_text('{"wall_s": "x", "warnings": 3, "bytes": null, "peak_memory_mb": []}')
     (batch / "costly" / "work" / "quality.json").write_text('{"flags": [{"x": 1}]}')
     planted = make_subject(batch / "planted") / "work" / "clips" / "x" / "work" / "sample_frames"
     planted.mkdir(parents=True)
     (planted / "frames.json").write_text('{"size": [1e200, 1e200], "frames": []}')
-    link_clip(make_subject(batch / "linked"), batch / "sound")
+    plant(make_subject(batch / "linked"), "work/clips/x", batch / "sound")
     code, output = limn(*arguments, **trusted)
     assert code == 2 and "Traceback" not in output and "5 subjects: 4 done, 1 input error" in output, output
     assert (batch / "sound" / "export" / "page.txt").is_file()
@@ -291,9 +270,9 @@ def test_no_home_and_a_profile_in_the_environment(tmp_path, pipeline):
 
 def test_one_linked_subject_keeps_no_other_from_being_cleaned(tmp_path, pipeline, capsys):
     for name in ("anna", "carl"):
-        work = make_subject(tmp_path / "batch" / name) / "work" / "read_text"
-        work.mkdir(parents=True)
-    link_stage(make_subject(tmp_path / "batch" / "bert"), tmp_path / "batch" / "anna")
+        (make_subject(tmp_path / "batch" / name) / "work" / "read_text").mkdir(parents=True)
+    victim = tmp_path / "batch" / "anna" / "work" / "read_text"
+    plant(make_subject(tmp_path / "batch" / "bert"), "work/read_text", victim)
     assert main(["clean", str(tmp_path / "batch"), "--pipeline", str(pipeline)]) == 2
     assert "a symbolic link in place of results" in capsys.readouterr().err
     assert not (tmp_path / "batch" / "anna" / "work").exists() and not (tmp_path / "batch" / "carl" / "work").exists()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quick import TINY
 from scipy.spatial import cKDTree
 from shapes import sphere
 
@@ -19,7 +20,6 @@ from tools.scoring import align, measures
 from tools.scoring.buffers import BufferRenderer
 from tools.scoring.score import main, score
 
-TINY = Path(__file__).resolve().parents[1] / "tiny"
 SCALE, TURN, SHIFT = 0.93, rotation_from_vector(np.array([0.1, -0.2, 0.05])), np.array([5.0, -20.0, 33.0])
 GAIN = np.array([0.8, 0.9, 1.1])
 

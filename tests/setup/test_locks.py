@@ -11,7 +11,8 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[2]
 TORCH = "requirements-torch-cpu.lock", "requirements-torch.lock"
-LOCKS = ("requirements-build.lock", "requirements.lock", *TORCH, "requirements-cluster.lock")
+LOCKS = ("requirements-build.lock", "requirements.lock", *TORCH, "requirements-cluster.lock",
+         "requirements-browser.lock")
 OPTIONS = {"--only-binary :all:", "--no-binary connection-pool"}
 HASH = re.compile(r"--hash=sha256:[0-9a-f]{64}")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -53,7 +54,8 @@ def test_a_package_is_in_one_lock_and_cuda_in_none():
 def test_what_the_project_asks_for_is_locked():
     project = PROJECT["project"]
     wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"],
-              *project["optional-dependencies"]["cluster"], *PROJECT["build-system"]["requires"]]
+              *project["optional-dependencies"]["cluster"], *project["optional-dependencies"]["browser"],
+              *PROJECT["build-system"]["requires"]]
     locked = {name for found in ALL.values() for name in found}
     assert {canonicalize_name(Requirement(text).name) for text in wanted} <= locked
 

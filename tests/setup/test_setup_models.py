@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from shapes import grid_plane
 from slow import SLOW
 
 from shared.contract.models import HEAD_MODEL_FILE, models_folder
@@ -102,16 +103,9 @@ class TestHost:
 class TestRelaxation:
     """The solver of the texture layout, on a grid of triangles over the unit square."""
 
-    @staticmethod
-    def _grid(count: int = 9) -> tuple[np.ndarray, np.ndarray]:
-        x, y = np.meshgrid(np.linspace(0, 1, count), np.linspace(0, 1, count))
-        index = np.arange(count * count).reshape(count, count)
-        a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-        faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-        return np.stack([x.ravel(), y.ravel()], axis=1), faces
-
     def test_gradient_and_hessian_match_differences(self):
-        place, faces = self._grid(4)
+        grid = grid_plane(4)
+        place, faces = grid.uvs, grid.faces
         rng = np.random.default_rng(2)
         rest, area = _rest_gradients(np.pad(place, ((0, 0), (0, 1))), faces, np.ones(len(faces)), 1.0)
         # Stretched, every twist mode is stable: the positive semidefinite Hessian is the Hessian.
@@ -130,7 +124,8 @@ class TestRelaxation:
             assert np.allclose(hessian[:, k].toarray().ravel(), curvature, rtol=1e-3, atol=1e-4)
 
     def test_a_rolled_sheet_is_unrolled_without_distortion(self):
-        flat, faces = self._grid()
+        grid = grid_plane(9)
+        flat, faces = grid.uvs, grid.faces
         rolled = np.stack([np.sin(2 * flat[:, 0]) / 2, flat[:, 1], np.cos(2 * flat[:, 0]) / 2], axis=1)
         # Facets of the cylinder are chords: their exact rest width.
         width = np.sin(1 / 8) * 8

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from shapes import turned
 from toy_head import toy_head
 
 from shared.geometry.mesh import Mesh, subdivide, vertex_normals
 from shared.geometry.raycast import RayScene, camera_hits
-from shared.geometry.transforms import rigid, rotation_from_vector
 from shared.imaging.views import Views
 from shared.shape.silhouette import ContourSettings, fit_outline, mask_distance, occluding_contour
 
@@ -17,7 +17,7 @@ LENS = np.array([[900.0, 0, SIZE / 2], [0, 900.0, SIZE / 2], [0, 0, 1]])
 def poses(frames=FRAMES):
     angle = np.linspace(-0.5, 0.5, frames)
     vectors = np.stack([0.1 * np.sin(6 * angle), angle, 0 * angle], axis=1)
-    return rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors), np.tile([0, 0, 900.0], (frames, 1)))
+    return turned(vectors)
 
 
 def views_of(mesh):

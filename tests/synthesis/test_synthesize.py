@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 from brute_force import reference_radiance
 from quadrature import hemisphere_quadrature
+from quick import TINY
 
 from shared.capture.chart import CORNERS, reflectances
 from shared.capture.chart_finder import read_chart
@@ -32,7 +31,6 @@ from tools.synthesis.sampling import shifted_hammersley
 from tools.synthesis.subject import main
 from tools.synthesis.surface import Materials, SyntheticSurface
 
-TINY = Path(__file__).resolve().parents[1] / "tiny"
 FRONT = rigid(WORLD_FROM_CAMERA, np.array([0.0, 0.0, 950.0]))
 ALBEDO = (0.6, 0.4, 0.3)
 

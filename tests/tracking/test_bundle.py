@@ -4,6 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 from scipy.optimize import least_squares
+from shapes import turned
 
 from shared.geometry.transforms import (
     project,
@@ -40,8 +41,7 @@ def head_turn(frames=12, points=150, noise_px=NOISE_PX, outliers=0.0, seed=0):
     cloud[:, 2] += 50 - cloud[:, 0] ** 2 / 80 - cloud[:, 1] ** 2 / 160
     angle = np.sin(np.linspace(0, 2 * np.pi, frames))
     vectors = np.stack([0.15 * angle[::-1], np.radians(25) * angle, 0.02 * angle], axis=1)
-    rotation = np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors)
-    poses = rigid(rotation, np.array([0, 0, 950.0]) + rng.normal(size=(frames, 3)) * 3)
+    poses = turned(vectors, np.array([0, 0, 950.0]) + rng.normal(size=(frames, 3)) * 3)
     observed = project(cloud, poses, LENS)[0] + noise_px * rng.normal(size=(frames, points, 2))
     wrong = rng.random((frames, points)) < outliers
     observed[wrong] += rng.normal(size=(wrong.sum(), 2)) * 20

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from shapes import nods
 
-from shared.geometry.transforms import projection_slope, rigid, rotation_from_vector
+from shared.geometry.transforms import projection_slope
 from shared.tracking.bundle import BundleSolution
 from shared.tracking.depth_noise import depth_noise
 
@@ -16,9 +17,7 @@ def head(half_angle_deg, count=900, frames=40):
     rng = np.random.default_rng(0)
     across = rng.uniform(-60.0, 60.0, (count, 2))
     points = np.column_stack([across, np.sqrt(100.0**2 - (across**2).sum(1))])
-    turn = np.radians(np.linspace(-half_angle_deg, half_angle_deg, frames))
-    facing = np.diag([1.0, -1.0, -1.0]) @ rotation_from_vector(np.stack([0 * turn, turn, 0 * turn], axis=1))
-    return points, rigid(facing, np.tile([0.0, 0.0, 800.0], (frames, 1)))
+    return points, nods(np.linspace(-half_angle_deg, half_angle_deg, frames), distance=800.0)
 
 
 def triangulated(points, poses, error_px):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from shapes import FACING, turned
 from toy_head import toy_head
 
 from shared.geometry.mesh import interpolate
@@ -73,7 +74,7 @@ def test_free_correction_is_stiff_where_depth_is_noise():
 
 def test_poses_move_with_the_head():
     fit = fit_codes(MODEL, *observed(true_head()), WEIGHTS)
-    pose = rigid(np.diag([1.0, -1, -1]), np.array([1.0, 2.0, 900.0]))[None]
+    pose = rigid(FACING, np.array([1.0, 2.0, 900.0]))[None]
     lens = np.array([[1000.0, 0, 0], [0, 1000.0, 0], [0, 0, 1]])
     points = np.random.default_rng(1).normal(size=(20, 3)) * 50
     before, _ = project(points, pose, lens)
@@ -83,10 +84,7 @@ def test_poses_move_with_the_head():
 
 def test_triangulation_inverts_projection():
     points = np.random.default_rng(2).normal(size=(30, 3)) * 50
-    poses = rigid(
-        np.diag([1.0, -1, -1]) @ rotation_from_vector(np.array([[0, a, 0] for a in (-0.3, 0.0, 0.3)])),
-        np.array([0.0, 0, 900.0]),
-    )
+    poses = turned([[0, a, 0] for a in (-0.3, 0.0, 0.3)])
     lens = np.array([[1000.0, 0, 320], [0, 1000.0, 240], [0, 0, 1]])
     assert np.allclose(triangulate(project(points, poses, lens)[0], poses, lens), points, atol=1e-6)
 
@@ -96,7 +94,7 @@ def test_landmarks_take_the_depth_of_the_tracks_around_them():
     points, _ = observed(truth, noise_mm=0.0)
     named = (MODEL.landmarks(truth) - SHIFT) @ ROTATION / SCALE
     middle = points.mean(0)
-    poses = rigid(np.diag([1.0, -1, -1])[None], (np.diag([-1.0, 1, 1]) @ middle + [0, 0, 900.0])[None])
+    poses = rigid(FACING[None], (np.diag([-1.0, 1, 1]) @ middle + [0, 0, 900.0])[None])
     lens = np.array([[1000.0, 0, 320], [0, 1000.0, 240], [0, 0, 1]])
     found = landmarks_on_points(project(named, poses, lens)[0], poses, points, lens)
     towards = named[:, 2] > np.percentile(named[:, 2], 60)

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from shapes import turned
 
 from shared.errors import InputError
-from shared.geometry.transforms import rigid, rotation_from_vector
 from shared.io.arrays import save_arrays
 from shared.tracking.given_tracking import read_given_landmarks, read_given_poses
 
@@ -18,20 +18,22 @@ def landmarks(count=5):
 
 def poses(count=5):
     vectors = 0.2 * np.random.default_rng(1).normal(size=(count, 3))
-    rotation = np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors)
-    return rigid(rotation, np.tile([0.0, 10, 700.0], (count, 1)))
+    return turned(vectors, (0.0, 10.0, 700.0))
+
+
+def given_file(folder, **arrays):
+    """An .npz of these arrays for the frames of FRAME_INDEX; what is None is left out."""
+    arrays = {"frame_index": FRAME_INDEX} | arrays
+    save_arrays(folder / "given.npz", **{name: array for name, array in arrays.items() if array is not None})
+    return folder / "given.npz"
 
 
 def landmark_file(folder, **changes):
-    arrays = {"landmarks_px": landmarks(), "frame_index": FRAME_INDEX} | changes
-    save_arrays(folder / "landmarks.npz", **{name: array for name, array in arrays.items() if array is not None})
-    return folder / "landmarks.npz"
+    return given_file(folder, **{"landmarks_px": landmarks()} | changes)
 
 
 def pose_file(folder, **changes):
-    arrays = {"camera_from_head": poses(), "frame_index": FRAME_INDEX} | changes
-    save_arrays(folder / "poses.npz", **{name: array for name, array in arrays.items() if array is not None})
-    return folder / "poses.npz"
+    return given_file(folder, **{"camera_from_head": poses()} | changes)
 
 
 def test_landmarks_come_into_the_crop(tmp_path):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from shapes import FACING, turned
 
 from shared.geometry.transforms import project, rigid, rotation_from_vector, vector_from_rotation
 from shared.tracking.bundle import BundleSolution, Tracks, adjust, pose_covariance
@@ -20,13 +21,12 @@ def cloud():
 
 def poses_of(yaw):
     """[F] rad -> [F, 4, 4]"""
-    vectors = np.stack([0 * yaw, yaw, 0 * yaw], axis=1)
-    return rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors), np.tile([0.0, 0, 950.0], (len(yaw), 1)))
+    return turned(np.stack([0 * yaw, yaw, 0 * yaw], axis=1), (0.0, 0.0, 950.0))
 
 
 def yaw_of(poses):
     """[F, 4, 4] -> [F] rad; the mean is taken off, since a common turn of the cloud is free."""
-    yaw = vector_from_rotation(np.diag([1.0, -1, -1]) @ poses[:, :3, :3])[:, 1]
+    yaw = vector_from_rotation(FACING @ poses[:, :3, :3])[:, 1]
     return yaw - yaw.mean()
 
 

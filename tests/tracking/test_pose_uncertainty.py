@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from shapes import turned
 
-from shared.geometry.transforms import project, rigid, rotation_from_vector
+from shared.geometry.transforms import project, rotation_from_vector
 from shared.tracking.bundle import BundleSolution, Tracks, adjust, zoomed
 from shared.tracking.first_poses import LOSS, Adjusted
 from shared.tracking.focal_search import farther
@@ -34,7 +35,7 @@ def face():
 def turn():
     angle = np.sin(np.linspace(0, 2 * np.pi, FRAMES))
     vectors = np.stack([0.15 * angle[::-1], np.radians(25) * angle, 0.02 * angle], axis=1)
-    return rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(vectors), np.tile([0.0, 0, 950.0], (FRAMES, 1)))
+    return turned(vectors, (0.0, 0.0, 950.0))
 
 
 def noise(cloud, shared_mm, seed):

@@ -5,17 +5,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from shapes import grid_plane
+from shapes import turned
+from toy_plane import LENS, PLANE, SIZE, plane_texture, see_plane
 
 from shared.compute.robust import ROBUST_SCALE
 from shared.geometry.atlas import BORDER_TEXELS, PlacedFrame, build_atlas, place_frame, sample
-from shared.geometry.raycast import RayScene, camera_hits
-from shared.geometry.transforms import project, rigid, rotation_from_vector
+from shared.geometry.transforms import project
 from shared.tracking.texture_tracks import LEAST_SPREAD, MeanContrast, Windows, mean_texture, track_frame
 
-LENS = np.array([[900.0, 0, 120], [0, 900.0, 120], [0, 0, 1]])
-SIZE = 240
-PLANE = grid_plane(9, extent=180.0)
 EVERY_FACE, EVERY_VERTEX = np.ones(len(PLANE.faces), bool), np.ones(len(PLANE.vertices), bool)
 CLEAN = np.zeros((SIZE, SIZE), np.uint8)
 WINDOWS = Windows(sigma=5.0, search=6.0, steps=6)
@@ -25,23 +22,18 @@ TURNS = [(yaw, pitch) for yaw in (-0.15, -0.05, 0.05, 0.15) for pitch in (-0.1, 
 
 def skin(size=720):
     """A texture with detail from two texels up, code values about 128."""
-    rng = np.random.default_rng(0)
-    noise = sum(cv2.GaussianBlur(rng.normal(size=(size, size)), (0, 0), s) * s for s in (5, 9))
-    return (128 + 35 * noise / noise.std()).clip(10, 245).astype(np.float32)
+    return plane_texture(size, (5, 9), 35.0)
 
 
 def render(pose, image, noise=0.0, seed=0):
     """What the camera sees of the textured plane, [H, W] uint8."""
-    face, bary, _ = camera_hits(RayScene(PLANE.vertices, PLANE.faces), pose, LENS, SIZE, SIZE)
-    uv = (PLANE.uvs[PLANE.faces[np.maximum(face, 0)]] * bary[..., None]).sum(2)
-    at = (uv * [image.shape[1], -image.shape[0]] + [0, image.shape[0]] - 0.5).astype(np.float32)
-    seen = np.where(face >= 0, cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR), 128)
+    seen, hit = see_plane(pose, image)
+    seen = np.where(hit, seen, 128)
     return (seen + noise * np.random.default_rng(seed).normal(size=seen.shape)).round().clip(0, 255).astype(np.uint8)
 
 
 def pose_of(yaw=0.0, pitch=0.0, shift=(0.0, 0.0)):
-    turn = rotation_from_vector(np.array([pitch, yaw, 0.0]))
-    return rigid(np.diag([1.0, -1, -1]) @ turn, np.array([*shift, 900.0]))
+    return turned([pitch, yaw, 0.0], (*shift, 900.0))
 
 
 def plane_atlas(count=300, usable=EVERY_FACE):

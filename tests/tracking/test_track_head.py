@@ -2,10 +2,11 @@
 
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from quick import TINY
+from shapes import nods, turned
 
 from shared.contract import main
 from shared.errors import InputError
@@ -19,8 +20,6 @@ from shared.tracking.track_head import carried_poses, follow_landmarks, refuse_s
 from shared.tracking.tracked_clip import TrackedClip
 from stages import sample_frames, track_landmarks
 
-TINY = Path(__file__).resolve().parents[1] / "tiny"
-
 
 def some_poses(count, seed=0):
     rng = np.random.default_rng(seed)
@@ -29,7 +28,7 @@ def some_poses(count, seed=0):
 
 
 def test_still_head_is_refused_with_what_to_film():
-    still = rigid(np.broadcast_to(np.diag([1.0, -1, -1]), (12, 3, 3)), np.tile([0.0, 0, 900.0], (12, 1)))
+    still = turned(np.zeros((12, 3)))
     shaken = still + np.pad(np.random.default_rng(0).normal(0, 0.05, (12, 3, 1)), ((0, 0), (0, 1), (3, 0)))
     for poses in (still, shaken):
         with pytest.raises(InputError, match="does not turn.*25 degrees to each side.*poster"):
@@ -106,9 +105,7 @@ INTRINSICS = np.array([[2700.0, 0, 200], [0, 2700.0, 200], [0, 0, 1]])
 
 def stopping_clip(named, bias_deg=1.5, frames=41):
     """A head that turns and stops at once, seen through landmarks that are turned by a constant bias."""
-    yaw = np.radians(np.minimum(np.arange(frames) * 1.5, 30.0))
-    turn = np.diag([1.0, -1, -1]) @ rotation_from_vector(np.stack([0 * yaw, yaw, 0 * yaw], axis=1))
-    poses = rigid(turn, np.tile([0.0, 0, 900.0], (frames, 1)))
+    poses = nods(np.minimum(np.arange(frames) * 1.5, 30.0))
     biased = np.nan_to_num(named) @ rotation_from_vector(np.radians([bias_deg, bias_deg, 0.0])).T
     pixels, _ = project(biased, poses, INTRINSICS)
     clip = TrackedClip([None] * frames, [], [], pixels, np.arange(frames) / 25.0, INTRINSICS, (400, 400))

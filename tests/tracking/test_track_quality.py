@@ -6,9 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from field_check import below, field_faults
+from shapes import nods
 
 from shared.contract.records import TRACKING
-from shared.geometry.transforms import rigid, rotation_from_vector, rotation_range_deg
+from shared.geometry.transforms import rotation_range_deg
 from shared.tracking.track_head import HeadTrack
 from shared.tracking.track_quality import frames_that_fit, mouth_ratio, warnings_of
 from stages.track_landmarks import excluded_frames
@@ -20,9 +21,7 @@ EVERY_FRAME = np.ones(FRAMES, bool)
 
 def turn(degrees):
     """Poses of a head that turns by so many degrees in all."""
-    yaw = np.radians(np.linspace(-degrees / 2, degrees / 2, FRAMES))
-    rotation = np.diag([1.0, -1, -1]) @ rotation_from_vector(np.stack([0 * yaw, yaw, 0 * yaw], axis=1))
-    return rigid(rotation, np.tile([0.0, 0, 900.0], (FRAMES, 1)))
+    return nods(np.linspace(-degrees / 2, degrees / 2, FRAMES))
 
 
 def good_track(**changes):

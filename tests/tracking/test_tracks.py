@@ -1,12 +1,12 @@
 """Dense tracks on a textured plane that turns before the camera, where each point's place is known."""
 
-import cv2
 import numpy as np
-from shapes import grid_plane
+from shapes import turned
+from toy_plane import LENS, PLANE, SIZE, plane_texture, see_plane
 
 from shared.geometry.mesh import vertex_normals
-from shared.geometry.raycast import RayScene, camera_hits
-from shared.geometry.transforms import project, rigid, rotation_from_vector
+from shared.geometry.raycast import RayScene
+from shared.geometry.transforms import project, rigid
 from shared.tracking.tracks import (
     dense_tracks,
     grid_from_landmarks,
@@ -17,15 +17,9 @@ from shared.tracking.tracks import (
     visible_vertices,
 )
 
-LENS = np.array([[900.0, 0, 120], [0, 900.0, 120], [0, 0, 1]])
-SIZE = 240
-PLANE = grid_plane(9, extent=180.0)
-
 
 def texture(size=512):
-    rng = np.random.default_rng(0)
-    noise = sum(cv2.GaussianBlur(rng.normal(size=(size, size)), (0, 0), s) * s for s in (4, 8, 16))
-    return (128 + 40 * noise / noise.std()).clip(20, 240).astype(np.float32)
+    return plane_texture(size, (4, 8, 16), 40.0)
 
 
 def contrast(image, sigma_px=4.0):
@@ -34,17 +28,13 @@ def contrast(image, sigma_px=4.0):
 
 def render(pose, image, gain=1.0):
     """What the camera sees of the textured plane, as uint8."""
-    scene = RayScene(PLANE.vertices, PLANE.faces)
-    face, bary, _ = camera_hits(scene, pose, LENS, SIZE, SIZE)
-    uv = (PLANE.uvs[PLANE.faces[np.maximum(face, 0)]] * bary[..., None]).sum(2)
-    at = (uv * [image.shape[1], -image.shape[0]] + [0, image.shape[0]] - 0.5).astype(np.float32)
-    seen = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-    return np.where(face >= 0, gain * seen, 5).clip(0, 255).astype(np.uint8)
+    seen, hit = see_plane(pose, image)
+    return np.where(hit, gain * seen, 5).clip(0, 255).astype(np.uint8)
 
 
 def poses():
     turns = np.array([[0, 0, 0], [0, 0.2, 0], [0.15, -0.2, 0.05]])
-    return rigid(np.diag([1.0, -1, -1]) @ rotation_from_vector(turns), np.array([0.0, 0, 900.0]))
+    return turned(turns)
 
 
 def test_tracks_find_the_skin_where_it_is_despite_a_change_of_light():

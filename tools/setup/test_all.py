@@ -3,9 +3,9 @@
     python -m tools.setup.test_all [--only-install] [PYTEST'S ARGUMENTS]
 
 From Debian (root and apt-get): Chromium, LLVM and TBB for Mitsuba, the libraries that Blender loads, OpenEXR's tools,
-Slurm and munge. From the package index: Mitsuba and Slurm's executor beside Limn, none of Limn's own packages changed,
-and Blender's bpy in .venv-blender, since it wants an older numpy. What is there is left alone. Exit code: pytest's, or
-1 where a part could not be installed and the tests passed without it.
+Slurm and munge. From the package index: Playwright, Mitsuba and Slurm's executor beside Limn, none of Limn's own
+packages changed, and Blender's bpy in .venv-blender, since it wants an older numpy. What is there is left alone. Exit
+code: pytest's, or 1 where a part could not be installed and the tests passed without it.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from tools.bench.peers.mitsuba import VARIABLE as MITSUBA_VARIABLE
 REPOSITORY = Path(__file__).resolve().parents[2]
 BLENDER = REPOSITORY / ".venv-blender"
 PIP = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps")
+LOCKED = (*PIP, "--require-hashes", "--requirement")
 LLVM = "libLLVM-19.so"
 PEERS = ("mitsuba==3.9.1", "drjit==1.5.0")
 BPY = "bpy==5.0.1"
@@ -71,6 +72,7 @@ def debian(*packages: str) -> tuple[str, ...]:
 
 PARTS = (
     OptionalPart("Chromium", has_program("chromium"), (debian("chromium"),)),
+    OptionalPart("Playwright", has_module("playwright"), ((*LOCKED, REPOSITORY / "requirements-browser.lock"),)),
     OptionalPart("OpenEXR's tools", has_program("exrheader"), (debian("openexr"),)),
     OptionalPart("LLVM 19 and TBB", lambda: llvm() is not None and any(Path("/usr/lib").glob("*/libtbb.so.12")),
                  (debian("libllvm19", "libtbb12"),)),
@@ -81,7 +83,7 @@ PARTS = (
         (BLENDER / "bin" / "python", "-m", "pip", "install", "--quiet", BPY))),
     OptionalPart("Slurm and munge", has_program("slurmctld", "slurmd", "munged"), (debian("slurm-wlm", "munge"),)),
     OptionalPart("Slurm's executor", has_module("snakemake_executor_plugin_slurm"),
-                 ((*PIP, "--require-hashes", "--requirement", REPOSITORY / "requirements-cluster.lock"),)),
+                 ((*LOCKED, REPOSITORY / "requirements-cluster.lock"),)),
 )
 
 

@@ -134,7 +134,17 @@ def ten_thousand(folder):
 
 @case("too many frames", "too long")
 def too_many(folder):
-    write_video(folder / "clip.mp4", [np.zeros((32, 32, 3), np.uint8)] * 20_001)
+    """One encoded frame, again and again."""
+    with av.open(str(folder / "clip.mp4"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"
+        black = av.VideoFrame.from_ndarray(np.zeros((32, 32, 3), np.uint8), format="rgb24")
+        (encoded,) = [*stream.encode(black), *stream.encode()]
+        for i in range(20_001):
+            packet = av.Packet(bytes(encoded))
+            packet.stream, packet.time_base, packet.pts, packet.dts = stream, stream.codec_context.time_base, i, i
+            packet.is_keyframe = True
+            container.mux(packet)
 
 
 @case("a header that counts a billion frames", "too long")

@@ -1,4 +1,4 @@
-"""How often each word occurs. `pause_s` makes it slow, `hoard_mb` large, the variable TOY_FAIL fail."""
+"""How often each word occurs. `pause_s` or the variable TOY_PAUSE_S makes it slow, `hoard_mb` large, TOY_FAIL fail."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def run(job: Job) -> None:
     if "TOY_PID" in os.environ:
         Path(os.environ["TOY_PID"]).write_text(str(os.getpid()))
     hoard = b"x" * (job.params.hoard_mb << 20)
-    for _ in job.progress(range(int(job.params.pause_s * 10)), "pause"):
+    pause_s = float(os.environ.get("TOY_PAUSE_S", job.params.pause_s))
+    for _ in job.progress(range(int(pause_s * 10)), "pause"):
         time.sleep(0.1 + 0 * len(hoard))
     if "TOY_FAIL" in os.environ:
         raise ValueError("the abacus broke")
