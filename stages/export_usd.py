@@ -189,7 +189,7 @@ def other_clips(job: Job, solve: dict) -> list:
     from shared.io.arrays import load_arrays
     from shared.io.frames import FrameSet
     from shared.io.images import read_exr
-    from shared.report.build import ClipResult
+    from shared.report.content import ClipResult
 
     results = []
     for clip in solve.get("clips", ())[1:]:
@@ -213,7 +213,7 @@ def write_lights(job: Job, writer, envmap, clips: list) -> None:
 def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     """The content of run.json: what each stage was told, what it took, what it found."""
     from shared.geometry.mesh_checks import mesh_warnings
-    from shared.report.gather import own_record, selection_record, stage_record, warnings_of
+    from shared.report.content import own_record, selection_record, stage_record, warnings_of
 
     records, warnings = {}, []
     for name in job.input_names:
@@ -265,8 +265,9 @@ def run(job: Job) -> None:
     from shared.io.frames import FrameSet
     from shared.io.images import read_exr
     from shared.io.meshes import load_mesh
-    from shared.report.build import ReportInputs, result_report
+    from shared.report.content import ReportInputs, result_content
     from shared.report.methods import methods_paragraphs, methods_text
+    from shared.report.page import report_html
 
     use_baseline_opencv()
     start, solved = time.perf_counter(), job.input("inverse_render")
@@ -289,9 +290,8 @@ def run(job: Job) -> None:
     folders = {name: job.input(name) for name in STAGE.inputs}
     files = [(output.path, output.help) for output in STAGE.outputs]
     result = ReportInputs(job.subject.name, folders, frames, mesh, poses, maps, envmap, solve, record, files, views,
-                          clips,
-                          methods_paragraphs(methods))
-    page = result_report(result, job.params.report_frames)
+                          clips, methods_paragraphs(methods))
+    page = report_html(result_content(result, job.params.report_frames))
     (job.out / "report.html").write_text(page, encoding="utf-8")
 
 

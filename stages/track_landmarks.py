@@ -184,8 +184,7 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
     from shared.io.arrays import save_arrays, write_json
     from shared.io.images import write_png
     from shared.io.meshes import save_mesh
-    from shared.report.tracking_overlay import overlay_strip
-    from shared.report.tracking_pictures import pose_curves, residual_map
+    from shared.report.tracking_pictures import overlay_strip, pose_curves, residual_map
     from shared.tracking.bundle import zoomed
     from shared.tracking.first_poses import choose_references
     from shared.tracking.track_quality import frames_that_fit

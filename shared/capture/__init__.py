@@ -2,6 +2,6 @@
 colour chart.
 
 Read in this order: landmarks, framing, face_tracker, frame_quality, background_motion, clip_survey, crop_pixels,
-cameras, sample_clip, chart, chart_finder, chart_picture, chart_watch.
+cameras, sample_clip, chart, chart_finder, chart_watch.
 May import: errors, contract, compute, geometry, imaging, io.
 """

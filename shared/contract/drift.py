@@ -14,10 +14,10 @@ from importlib import metadata
 from pathlib import Path, PurePosixPath
 
 from shared.contract.manifest import PROVENANCE, read_record
-from shared.contract.source import fingerprint
+from shared.contract.source import CODE_SUFFIXES, fingerprint
 
-IDLE_PACKAGES = frozenset({"limn", "charset-normalizer", "packaging", "psutil", "PyYAML", "setuptools", "tqdm",
-                           "typing_extensions"})
+IDLE_PACKAGES = frozenset({"limn", "charset-normalizer", "Jinja2", "MarkupSafe", "packaging", "psutil", "PyYAML",
+                           "setuptools", "tqdm", "typing_extensions"})
 """Loaded by stages without touching their numbers; every other package counts. Limn's own code has its fingerprints."""
 _SHOWN = 3
 _LONGEST = 200
@@ -57,7 +57,7 @@ def _shortened(names: Sequence[str]) -> str:
 def _fingerprint_of(name: str, roots: tuple[Path, ...]) -> str:
     """Of the file as it is now, '' where it is gone, damaged or no file of ours."""
     relative = PurePosixPath(name)
-    if relative.is_absolute() or ".." in relative.parts or relative.suffix != ".py":
+    if relative.is_absolute() or ".." in relative.parts or relative.suffix not in CODE_SUFFIXES:
         return ""
     path = next((root / relative for root in roots if (root / relative).is_file()), None)
     try:

@@ -20,6 +20,8 @@ from shared.errors import InputError, LimnError
 
 _STANDARD_LIBRARY = sysconfig.get_path("stdlib")
 _INSTALLED = {"site-packages", "dist-packages"}
+CODE_SUFFIXES = frozenset({".py", ".j2", ".css", ".js"})
+"""Modules, and templates of pages with their styles and scripts."""
 
 
 def read_declaration(path: Path) -> Stage:
@@ -47,23 +49,30 @@ def read_declaration(path: Path) -> Stage:
 def loaded_code(roots: Sequence[Path]) -> dict[str, str]:
     """{file relative to the first of the folders that holds it: fingerprint} of the modules loaded from there.
 
-    This package and all that is installed are left out.
+    A module that fills templates names their folder, TEMPLATES: its files count as the module's own. This package and
+    all that is installed are left out.
     """
-    files = {Path(module.__file__) for module in list(sys.modules.values()) if getattr(module, "__file__", None)}
+    modules = {Path(module.__file__): module for module in list(sys.modules.values())
+               if getattr(module, "__file__", None)}
+    ours = {path: module for path, module in modules.items() if any(path.is_relative_to(root) for root in roots)}
+    folders = {vars(module)["TEMPLATES"] for module in ours.values() if "TEMPLATES" in vars(module)}
+    files = {*ours, *(path for folder in folders for path in Path(folder).iterdir())}
     names: dict[str, Path] = {}
     for path in sorted(files):
         root = next((root for root in roots if path.is_relative_to(root)), None)
-        if root is not None and path.suffix == ".py" and not path.is_relative_to(_STANDARD_LIBRARY):
+        if root is not None and path.suffix in CODE_SUFFIXES and not path.is_relative_to(_STANDARD_LIBRARY):
             names.setdefault(path.relative_to(root).as_posix(), path)
     return {name: fingerprint(path) for name, path in names.items()
             if not name.startswith((".", "shared/contract/")) and _INSTALLED.isdisjoint(path.parts)}
 
 
 def fingerprint(path: Path) -> str:
-    """SHA-256 of the file's byte code: without comments, layout, docstrings and assertions.
+    """SHA-256 of the file's byte code: without comments, layout, docstrings and assertions; of a template's bytes.
 
     Advisory: a stage runs again when its version changes, not when this does; see drift.py.
     """
+    if path.suffix != ".py":
+        return hashlib.sha256(path.read_bytes()).hexdigest()
     code = compile(path.read_bytes(), "", "exec", dont_inherit=True, optimize=2)
     return hashlib.sha256(marshal.dumps(_without_lines(code), 2)).hexdigest()  # 2: the last without shared references
 

@@ -62,6 +62,13 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return normalised(total)
 
 
+def shading_normals(mesh: Mesh) -> np.ndarray:
+    """[V, 3] unit normals; where there are only faces without area around a vertex, any unit vector."""
+    normals = vertex_normals(mesh.vertices, mesh.faces)
+    normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 0.0, 1.0)
+    return normals
+
+
 def half_edges(faces: np.ndarray) -> np.ndarray:
     """[F, 3] -> [3 F, 2]: each face's edges in its orientation; corners 0 and 1 of all faces, then 1 and 2, 2 and 0."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])

@@ -20,10 +20,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from shared.errors import LimnError
-from shared.geometry.mesh import Mesh, unique_pairs
+from shared.geometry.mesh import Mesh, shading_normals, unique_pairs
 from shared.io.export_maps import integer_codes
 from shared.io.usd_capture import UsdCapture, world_from_head_rigid, world_from_usd_camera
-from shared.io.usd_geometry import shading_normals
 
 METRES_PER_MM = 0.001
 _FLOAT, _UINT = 5126, 5125

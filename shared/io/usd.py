@@ -28,7 +28,7 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from shared.errors import LimnError
-from shared.geometry.mesh import Mesh
+from shared.geometry.mesh import Mesh, shading_normals
 from shared.io.usd_capture import (
     Plate,
     UsdCapture,
@@ -38,7 +38,6 @@ from shared.io.usd_capture import (
     define_plate,
     world_from_head_rigid,
 )
-from shared.io.usd_geometry import define_mesh
 from shared.io.usd_material import TextureFile, define_material
 
 METERS_PER_UNIT = 0.001
@@ -209,3 +208,25 @@ def _camera_metadata(capture: UsdCapture) -> dict:
         "focal_length_px": Gf.Vec2d(float(k[0, 0]), float(k[1, 1])),
         "principal_point_px": Gf.Vec2d(float(k[0, 2]), float(k[1, 2])),
     }
+
+
+def define_mesh(stage: Usd.Stage, path: str, mesh: Mesh) -> UsdGeom.Mesh:
+    """A polygon mesh (subdivisionScheme none) with indexed faceVarying UVs and normals, and its extent."""
+    prim = UsdGeom.Mesh.Define(stage, path)
+    points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.vertices, np.float32))
+    faces = Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.faces.ravel(), np.int32))
+    prim.CreatePointsAttr(points)
+    prim.CreateFaceVertexIndicesAttr(faces)
+    prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
+    prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    prim.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
+    prim.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
+    primvars = UsdGeom.PrimvarsAPI(prim)
+    types, varying = Sdf.ValueTypeNames, UsdGeom.Tokens.faceVarying
+    coordinates = primvars.CreatePrimvar("st", types.TexCoord2fArray, varying)
+    coordinates.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(mesh.uvs, np.float32)))
+    coordinates.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.face_uvs.ravel(), np.int32)))
+    normals = primvars.CreatePrimvar("normals", types.Normal3fArray, varying)
+    normals.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(shading_normals(mesh), np.float32)))
+    normals.SetIndices(faces)
+    return prim

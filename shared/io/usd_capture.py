@@ -13,10 +13,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, Vt
 
 from shared.geometry.transforms import WORLD_FROM_CAMERA, invert_rigid
-from shared.io.usd_geometry import define_card
 from shared.io.usd_material import TextureFile, define_plate_material
 
 DEFAULT_FILM_WIDTH_MM = 36.0
@@ -147,3 +146,23 @@ def define_plate(stage: Usd.Stage, path: str, capture: UsdCapture, plate: Plate)
     if capture.moves == "camera":
         animate(holder, world_from_usd_camera(capture), capture.frame_index)
     return holder
+
+
+def define_card(stage: Usd.Stage, path: str, corners: np.ndarray) -> UsdGeom.Mesh:
+    """A textured quadrilateral of purpose guide: tools show it on request, renders and bounds leave it out.
+
+    corners [4, 3]: bottom left, bottom right, top right, top left of the picture.
+    """
+    prim = UsdGeom.Mesh.Define(stage, path)
+    points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(corners, np.float32))
+    prim.CreatePointsAttr(points)
+    prim.CreateFaceVertexIndicesAttr(Vt.IntArray([0, 1, 2, 3]))
+    prim.CreateFaceVertexCountsAttr(Vt.IntArray([4]))
+    prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    prim.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
+    prim.CreatePurposeAttr(UsdGeom.Tokens.guide)
+    coordinates = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(
+        "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
+    )
+    coordinates.Set(Vt.Vec2fArray([Gf.Vec2f(0, 0), Gf.Vec2f(1, 0), Gf.Vec2f(1, 1), Gf.Vec2f(0, 1)]))
+    return prim

@@ -1,12 +1,15 @@
-"""Line charts as inline SVG: sharp in print, readable on a phone, no library."""
+"""Line charts as inline SVG: sharp in print, readable on a phone."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from html import escape
+from pathlib import Path
 
 import numpy as np
 
+from shared.report.template import filled
+
+TEMPLATES = Path(__file__).with_name("templates")
 _WIDTH, _HEIGHT = 640, 240
 _LEFT, _RIGHT, _TOP, _BOTTOM = 66, 12, 12, 40
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -38,16 +41,15 @@ def line_chart(
         down = _TOP + (high - np.asarray(py)) / (high - low) * (_HEIGHT - _TOP - _BOTTOM)
         return across, down
 
-    parts = [*_grid(to_pixels, (x_low, x_high), (low, high)), *_titles(x_label, y_label)]
-    for mark in marks:
-        across = float(to_pixels(mark, low)[0])
-        parts.append(f'<path class="mark" d="M{across:.1f} {_HEIGHT - _BOTTOM}v-8"/>')
-    for colour, curve in zip(COLOURS, curves.values(), strict=False):
-        path = _path(*to_pixels(x, curve))
-        parts.append(f'<path class="curve" stroke="{colour}" d="{path}"/>')
-    label = escape(f"{', '.join(curves)} over {x_label}")
-    svg = f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
-    return svg + _legend(curves)
+    shown = zip(COLOURS, curves.items(), strict=False)
+    return filled(TEMPLATES, "line_chart.svg.j2", {
+        "width": _WIDTH, "height": _HEIGHT, "left": _LEFT, "right": _WIDTH - _RIGHT, "top": _TOP,
+        "bottom": _HEIGHT - _BOTTOM, "x_label": x_label, "y_label": y_label,
+        "y_ticks": [(float(to_pixels(x_low, tick)[1]), tick) for tick in nice_ticks(low, high)],
+        "x_ticks": [(float(to_pixels(tick, low)[0]), tick) for tick in nice_ticks(x_low, x_high, 8)],
+        "marks": [float(to_pixels(mark, low)[0]) for mark in marks],
+        "curves": [(name, colour, _path(*to_pixels(x, curve))) for colour, (name, curve) in shown],
+    })
 
 
 def _span(values: np.ndarray, from_zero: bool) -> tuple[float, float]:
@@ -66,28 +68,6 @@ def nice_ticks(low: float, high: float, count: int = 5) -> np.ndarray:
     return np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step + 0.0  # -0 becomes 0
 
 
-def _grid(to_pixels, x_span: tuple[float, float], y_span: tuple[float, float]) -> list[str]:
-    parts = []
-    for tick in nice_ticks(*y_span):
-        down = float(to_pixels(x_span[0], tick)[1])
-        parts.append(f'<path class="grid" d="M{_LEFT} {down:.1f}H{_WIDTH - _RIGHT}"/>')
-        parts.append(f'<text x="{_LEFT - 6}" y="{down + 4:.1f}" text-anchor="end">{tick:.4g}</text>')
-    for tick in nice_ticks(*x_span, 8):
-        across = float(to_pixels(tick, y_span[0])[0])
-        parts.append(f'<path class="grid" d="M{across:.1f} {_TOP}V{_HEIGHT - _BOTTOM}"/>')
-        below = _HEIGHT - _BOTTOM + 17
-        parts.append(f'<text x="{across:.1f}" y="{below}" text-anchor="middle">{tick:.4g}</text>')
-    return parts
-
-
-def _titles(x_label: str, y_label: str) -> list[str]:
-    middle = (_TOP + _HEIGHT - _BOTTOM) / 2
-    return [
-        f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2}" y="{_HEIGHT - 4}" text-anchor="middle">{escape(x_label)}</text>',
-        f'<text transform="translate(14 {middle}) rotate(-90)" text-anchor="middle">{escape(y_label)}</text>',
-    ]
-
-
 def _path(across: np.ndarray, down: np.ndarray) -> str:
     """Move-to after each gap, else line-to."""
     parts, pen_down = [], False
@@ -98,11 +78,3 @@ def _path(across: np.ndarray, down: np.ndarray) -> str:
         parts.append(f"{'L' if pen_down else 'M'}{px:.1f} {py:.1f}")
         pen_down = True
     return "".join(parts)
-
-
-def _legend(curves: Mapping[str, Sequence[float]]) -> str:
-    entries = (
-        f'<span><i style="background:{colour}"></i>{escape(name)}</span>'
-        for colour, name in zip(COLOURS, curves, strict=False)
-    )
-    return f'<p class="legend">{"".join(entries)}</p>'

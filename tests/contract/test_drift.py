@@ -3,15 +3,20 @@
 import ast
 import json
 import os
+import platform
 import shutil
+import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 from toy_runs import READ_TEXT, REPOSITORY, copy_pipeline, limn, make_subject, outputs_of
 
 from shared.contract import Stage, main, models
+from shared.contract import drift as drift_module
 from shared.contract.drift import drift
 from shared.contract.manifest import read_manifest
+from shared.contract.source import loaded_code
 from tools.limn import main as limn_main
 
 OLD_NUMPY = "1.0.0"
@@ -42,6 +47,27 @@ def pretend_old_package(folder):
     record = json.loads((folder / "provenance.json").read_text())
     record["packages"]["numpy"] = OLD_NUMPY
     (folder / "provenance.json").write_text(json.dumps(record))
+
+
+def test_a_template_is_code_of_the_module_that_fills_it(tmp_path, monkeypatch):
+    (tmp_path / "templates").mkdir()
+    page = tmp_path / "templates" / "page.html.j2"
+    page.write_text("<p>{{ text }}</p>")
+    (tmp_path / "made_up_pages.py").write_text("from pathlib import Path\n"
+                                               "TEMPLATES = Path(__file__).with_name('templates')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "made_up_pages", raising=False)
+    import_module("made_up_pages")
+    roots = (tmp_path,)
+    code = loaded_code(roots)
+    monkeypatch.delitem(sys.modules, "made_up_pages")
+    assert code.keys() == {"made_up_pages.py", "templates/page.html.j2"}
+    (tmp_path / "provenance.json").write_text(json.dumps({"code": code, "packages": {},
+                                                          "python": platform.python_version()}))
+    assert drift(tmp_path, roots) == []
+    page.write_text("<b>{{ text }}</b>")
+    drift_module._fingerprint_of.cache_clear()
+    assert drift(tmp_path, roots) == ["code has changed: templates/page.html.j2"]
 
 
 def test_run_says_what_it_keeps_although_the_code_changed_and_renews_it(case):

@@ -15,9 +15,9 @@ from shared.geometry.mesh import subdivide, vertex_normals
 from shared.geometry.transforms import rigid, rotation_from_vector
 from shared.report.advice import advice
 from shared.report.charts import line_chart, nice_ticks
-from shared.report.gather import chosen_frames, excluded_frames, motion, warnings_of
+from shared.report.content import chosen_frames, excluded_frames, motion, number, warnings_of
+from shared.report.page import flat
 from shared.report.pictures import ERROR_RANGE, error_bytes, grey_bytes, shrunk, srgb_bytes, viridis_bytes
-from shared.report.sections import flat, number
 from shared.report.viewer import coarser, irradiance_harmonics, packed, reduced
 from stages import export_usd
 

@@ -11,7 +11,7 @@ from shared.contract.folders import RunFolder
 from shared.io.arrays import read_json
 from shared.io.frames import FrameSet
 from shared.io.images import read_exr, read_png, write_png
-from shared.report.gather import compared_frames
+from shared.report.content import compared_frames
 from shared.report.pictures import error_bytes, srgb_bytes, viridis_bytes
 from tools.cli.measures import clips_of, confidence_map, tracking_errors, tracking_records
 from tools.cli.records import PICTURE
