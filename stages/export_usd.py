@@ -229,7 +229,7 @@ def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     kept = ("model", "residuals", "albedo_scale", "held_out_frames", "clips")
     chosen = {key: solve[key] for key in kept if key in solve}
     if selection := selection_record(job.input("inverse_render"), solve):
-        chosen["ladder"] = selection
+        chosen["model_selection"] = selection
     return {
         "subject": job.subject.name,
         "stages": records,

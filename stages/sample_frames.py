@@ -23,7 +23,7 @@ from shared.errors import InputError, LimnError
 
 STAGE = Stage(
     name="sample_frames",
-    version=4,
+    version=5,
     help="Decode the clip, choose good frames evenly in time, crop them to the head and mask the person.",
     inputs=(),
     models=FACE_NETWORKS,

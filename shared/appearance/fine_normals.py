@@ -169,8 +169,8 @@ class NormalPass:
         pose, picture, lens = views.camera_from_head[f], views.picture(f), views.intrinsics[f]
         view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
         slope = self.vectors.frames(slice(f, f + 1))[:, 0]
-        gloss, gloss_slope = self.reflections.at(f, shading.points.normals)
-        of_points = np.concatenate([gloss, slope.reshape(-1, 9), gloss_slope.reshape(-1, 9)], axis=1)
+        reflection, reflection_slope = self.reflections.at(f, shading.points.normals)
+        of_points = np.concatenate([reflection, slope.reshape(-1, 9), reflection_slope.reshape(-1, 9)], axis=1)
         values = np.concatenate([shading.irradiance(f), of_points[shading.stand_in]], axis=1)
         return self.surface.frame_view(view, picture, lens, values)
 
@@ -243,9 +243,9 @@ def _differentiate(rows, values, albedo, specular, tangents, derivative):
 def _add_to_corners(corner, weight, scale, error, total, sums):
     for i in range(len(corner)):
         for c in range(3):
-            trust = weight[i, c] * scale[i, c]
-            total[corner[i], c] += trust * scale[i, c]
-            sums[corner[i], c] += trust * error[i, c]
+            weighted = weight[i, c] * scale[i, c]
+            total[corner[i], c] += weighted * scale[i, c]
+            sums[corner[i], c] += weighted * error[i, c]
 
 
 @compiled

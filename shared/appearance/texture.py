@@ -148,20 +148,20 @@ class NormalEquations:
     def highlight_variance(self, specular: float | np.ndarray) -> np.ndarray:
         """[T, 3] of the log albedo, since highlights of intensity `specular`, one or [T], are wrong by HIGHLIGHT_ERROR
         of themselves: little where they are a small share of what a texel sends out, all of it in hair that the model
-        gives a skin's gloss."""
+        gives a skin's specular intensity."""
         share = np.reshape(specular, (-1, 1)) * self.es / np.maximum(self.ei, 1e-9)
         return np.square(HIGHLIGHT_ERROR * share / np.maximum(1.0 - share, LEAST_MATTE_SHARE))
 
     def _bounded_albedo(self, typical_albedo: np.ndarray) -> np.ndarray:
         return np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)
 
-    def scale(self, trust: float) -> None:
-        """All weights times that."""
-        if trust != 1.0:
-            self.sums *= trust
-            self.clipped_ee *= trust
+    def scale(self, factor: float) -> None:
+        """All weights times factor."""
+        if factor != 1.0:
+            self.sums *= factor
+            self.clipped_ee *= factor
 
-    def trusted_share(self, typical_albedo: np.ndarray, systematic: np.ndarray) -> np.ndarray:
+    def independent_share(self, typical_albedo: np.ndarray, systematic: np.ndarray) -> np.ndarray:
         """[T, 3]: how much of their weight errors that all frames share leave to the equations, among those of other
         lights."""
         precision = self.ee * np.square(self._bounded_albedo(typical_albedo)) / CORRELATED_FRAMES
@@ -191,7 +191,7 @@ def weigh_lights(
     whole = NormalEquations(len(information), parts[0].noise)
     left = np.zeros_like(information)
     for own, error in zip(parts, systematic, strict=True):
-        share = own.trusted_share(typical_albedo, error)
+        share = own.independent_share(typical_albedo, error)
         whole.sums += own.sums * np.tile(share, PRODUCTS)
         whole.clipped_ee += own.clipped_ee * share
         left += np.square(own.ee * share) * error
@@ -226,8 +226,8 @@ def _add_samples(
         for c in range(3):
             colour, e, s = colours[i, c], irradiance[i, c], reflection[i, c]
             sigma, border = absolute + relative * colour, shadow[i, c]
-            trust = weight[i] / (sigma * sigma + border * border)
-            weighted = trust * robust[i, c]
+            precision = weight[i] / (sigma * sigma + border * border)
+            weighted = precision * robust[i, c]
             sums[row, c] += weighted * e * e
             sums[row, 3 + c] += weighted * e * s
             sums[row, 6 + c] += weighted * e * colour
@@ -237,7 +237,7 @@ def _add_samples(
             if saturation[i, c] == 0:
                 sums[row, 15 + c] += weighted * e * e
             elif saturation[i, c] > 0:
-                clipped_ee[row, c] += trust * e * e
+                clipped_ee[row, c] += precision * e * e
 
 
 def robust_weight(
@@ -251,7 +251,7 @@ def robust_weight(
     """Cauchy weight [n, 3] of each sample given the model [n, 3]; 0 where a clipped or crushed sample's bound is
     inactive.
 
-    information [T]: precision of the model's log albedo; what it leaves open is no reason to distrust a sample; shadow
+    information [T]: precision of the model's log albedo; what it leaves open does not lower a sample's weight; shadow
     [n, 3]: standard deviation of the model since borders of shadows may lie elsewhere; None: of none.
     """
     shadow, weight = np.zeros_like(model) if shadow is None else shadow, np.empty_like(model)

@@ -173,11 +173,11 @@ def _project(found, texel_mm, rows, focal_length, pixels, footprint):
 
 
 @compiled
-def _scatter(corners, weights, values, trust, sums, total):
+def _scatter(corners, weights, values, precision, sums, total):
     for t in range(len(corners)):
         for k in range(3):
             vertex, share = corners[t, k], weights[t, k]
             for c in range(values.shape[1]):
-                part = np.float64(share) * trust[t, c]
+                part = np.float64(share) * precision[t, c]
                 total[vertex, c] += part
                 sums[vertex, c] += part * values[t, c]

@@ -192,13 +192,13 @@ class VertexShading:
 
 def _stand_ins(vertices: np.ndarray, index: np.ndarray, blocked: np.ndarray, deep: float) -> np.ndarray:
     """[V]: for each vertex the place in index of the nearest shaded vertex in the open, its own where it is one."""
-    trusted = np.nonzero(blocked < deep)[0]
-    if len(trusted) == 0:
-        trusted = np.arange(len(index))
+    open_points = np.nonzero(blocked < deep)[0]
+    if len(open_points) == 0:
+        open_points = np.arange(len(index))
     result = np.full(len(vertices), -1)
-    result[index[trusted]] = trusted
+    result[index[open_points]] = open_points
     others = np.nonzero(result < 0)[0]
-    result[others] = trusted[cKDTree(vertices[index[trusted]]).query(vertices[others])[1]]
+    result[others] = open_points[cKDTree(vertices[index[open_points]]).query(vertices[others])[1]]
     return result
 
 

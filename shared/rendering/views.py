@@ -171,10 +171,10 @@ class HeadViews:
         uv[mesh.faces.ravel()] = mesh.uvs[mesh.face_uvs.ravel()]
         nearest = cKDTree(mesh.vertices).query(self.precomputed.nodes.points.positions)[1]
         albedo = sample_bilinear(maps["diffuse_albedo"], uv[nearest])
-        gloss = float(np.median(sample_bilinear(maps["specular_intensity"], uv)))
+        specular = float(np.median(sample_bilinear(maps["specular_intensity"], uv)))
         roughness = sample_bilinear(maps["roughness"], uv).ravel()
         varies = np.ptp(roughness) > 1e-3
-        return Material(albedo, gloss, float(np.median(roughness)), roughness[self.index] if varies else None)
+        return Material(albedo, specular, float(np.median(roughness)), roughness[self.index] if varies else None)
 
     def render(
         self, light: np.ndarray, cameras: Sequence[ViewCamera], moves: str = "camera", fade: bool = True

@@ -86,7 +86,7 @@ def result_report(result: ReportInputs, frame_count: int) -> str:
         chart=read_png(chart) if chart.is_file() else None,
         excluded=excluded,
         model={**solve.get("model", {}), "albedo_scale": solve.get("albedo_scale")},
-        selection=record.get("ladder", ()),
+        selection=record.get("model_selection", ()),
         residuals=solve.get("residuals", {}),
         iterations=solve.get("iterations", []),
         costs=[_cost(name, values) for name, values in record["stages"].items()],

@@ -16,7 +16,7 @@ from shared.io.frames import FrameSet
 from shared.io.images import read_exr
 from shared.report.content import Frame
 
-SELECTION_SECONDS = "ladder_seconds.json"
+SELECTION_SECONDS = "model_selection_seconds.json"
 RESULT_FILES = {"sample_frames": "frames.json", "track_landmarks": "tracking.json", "inverse_render": "solve.json"}
 
 
@@ -30,7 +30,7 @@ def stage_record(manifest: Mapping, provenance: Mapping) -> dict:
 def selection_record(folder: Path, solve: Mapping) -> list[dict]:
     """The candidates of inverse_render's model selection with the seconds that each took; empty where there was
     none."""
-    candidates, seconds = solve.get("ladder", ()), folder / SELECTION_SECONDS
+    candidates, seconds = solve.get("model_selection", ()), folder / SELECTION_SECONDS
     took = read_json(seconds) if seconds.is_file() else [None] * len(candidates)
     return [{**candidate, "seconds": value} for candidate, value in zip(candidates, took, strict=True)]
 

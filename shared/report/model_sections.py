@@ -31,8 +31,8 @@ def selection_section(content: ReportContent) -> str:
 
 def selection_table(selection: Sequence[Mapping]) -> str:
     """The models that were tried, candidate by candidate."""
-    head = ("part", "rung", "held-out error", "fell by", "standard error", "climbed", "seconds")
-    keys = ("part", "rung", "held_out", "fall", "standard_error", "climbed", "seconds")
+    head = ("part", "candidate", "held-out error", "fell by", "standard error", "accepted", "seconds")
+    keys = ("part", "candidate", "held_out", "fall", "standard_error", "accepted", "seconds")
     errors = ("held_out", "fall", "standard_error")
     rows = [[f"{row[key]:.6f}" if key in errors and row[key] is not None else number(row[key]).replace("_", " ")
              for key in keys] for row in selection]
@@ -44,7 +44,7 @@ def selection_table(selection: Sequence[Mapping]) -> str:
 def solved_models(
     iterations: Sequence[Mapping], residuals: Mapping[str, object], model: Mapping[str, object]
 ) -> list[dict]:
-    """Models from what the solver logged: one per light model and resolution, one per width of the gloss.
+    """Models from what the solver logged: one per light model and resolution, one per width of the specular map.
 
     Errors are those of the last step of each; chosen: where model names it.
     """
@@ -60,7 +60,7 @@ def solved_models(
     tried = residuals.get("texture_held_out")
     for name, error in (tried.items() if isinstance(tried, Mapping) else ()):
         chosen = name == model.get("specular_variation")
-        candidates.append({"model": f"gloss over the map, {name}", "steps": None, "fitted": None, "held_out": error,
+        candidates.append({"model": f"specular map, {name}", "steps": None, "fitted": None, "held_out": error,
                            "chosen": chosen})
     return candidates
 
@@ -73,7 +73,7 @@ def residual_section(content: ReportContent, frames: Sequence[Mapping]) -> str:
     rows = []
     pair = [content.residuals.get(name) for name in ("fitted", "held_out")]
     if any(isinstance(value, (int, float)) for value in pair):
-        rows.append(("light and gloss, at sample points (share of full scale)", *map(number, pair)))
+        rows.append(("light and specular, at sample points (share of full scale)", *map(number, pair)))
     known = [frame for frame in frames if frame["psnr"] is not None]
     kinds = [[frame["psnr"] for frame in known if frame["held_out"] == held] for held in (False, True)]
     shown = [f"{np.mean(values):.1f}" if values else "-" for values in kinds]

@@ -47,7 +47,7 @@ def report_html(content: ReportContent) -> str:
         ("excluded", "Frames left out", sections.excluded_section(content.excluded)),
         *([("clips", "Other clips", sections.clips_section(content.clips))] if content.clips else []),
         ("residuals", "Residuals", model_sections.residual_section(content, frames)),
-        ("ladder", "Models tried", model_sections.selection_section(content)),
+        ("model_selection", "Models tried", model_sections.selection_section(content)),
         ("cost", "Time and memory", sections.cost_section(content)),
         ("parameters", "Parameters", sections.parameter_section(content)),
         ("methods", "Methods", model_sections.methods_section(content.methods)),

@@ -162,8 +162,8 @@ class ModelSelection:
             return False
         self.tried.add(model)
         trial = self._try(model, None)
-        glossier = model.specular != self.present.model.specular
-        better = serves(self.present.errors, trial.errors, WORTHWHILE_SPECULAR if glossier else WORTHWHILE)
+        more_specular = model.specular != self.present.model.specular
+        better = serves(self.present.errors, trial.errors, WORTHWHILE_SPECULAR if more_specular else WORTHWHILE)
         self.report(describe("leap", ", ".join(model), trial, self.present, better))
         if better:
             self.present = trial
@@ -245,10 +245,10 @@ def describe(part: str, candidate: str, trial: Trial, below: Trial | None = None
     fall, standard_error = (None, None) if below is None else gain(below.errors, trial.errors)
     return {
         "part": part,
-        "rung": candidate,
+        "candidate": candidate,
         "held_out": float(trial.errors.mean()),
         "fall": fall,
         "standard_error": standard_error,
-        "climbed": selected,
+        "accepted": selected,
         "seconds": round(trial.seconds, 3),
     }

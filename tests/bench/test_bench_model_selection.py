@@ -7,7 +7,7 @@ from tools.bench.model_selection import compare, main, read_rows, write_rows
 
 
 def row(clip, candidate, mesh, error, seconds):
-    return {"clip": clip, "rung": candidate, "mesh": mesh, "held_out": 1.2 * error, "held_out_abs": error,
+    return {"clip": clip, "candidate": candidate, "mesh": mesh, "held_out": 1.2 * error, "held_out_abs": error,
             "cpu_s": seconds,
             "light": "cubemap 8", "visibility": "bounces", "specular": True, "chosen": ""}
 
@@ -25,7 +25,7 @@ def test_model_selection_is_compared_with_the_best_fixed_candidate():
 
 
 def test_rows_survive_the_table_and_are_not_measured_again(tmp_path, monkeypatch, capsys):
-    table = tmp_path / "ladder.csv"
+    table = tmp_path / "candidates.csv"
     write_rows(table, TABLE[:2])
     assert [float(old["held_out_abs"]) for old in read_rows(table)] == [0.0103, 0.02]
     measured = []

@@ -22,12 +22,12 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
+from shared.inverse.light_and_mesh import solve_light
 
 from shared.appearance.fit import Solution
 from shared.geometry.transforms import fibonacci_sphere
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.inverse.clip_inputs import ClipInputs, read_inputs
-from shared.inverse.light_and_mesh import solve_light
 from shared.inverse.problem import frames_to_fit
 from shared.rendering.lobes import SpecularTransfer
 from shared.rendering.specular_transfer import specular_tables
@@ -48,7 +48,9 @@ CANDIDATES: dict[str, dict] = {
     "cubemap_16_no_visibility": {"light_resolution": 16, "visibility": False},
     "cubemap_32": {"light_resolution": 32},
 }
-COLUMNS = ("clip", "rung", "mesh", "held_out", "held_out_abs", "cpu_s", "light", "visibility", "specular", "chosen")
+COLUMNS = (
+    "clip", "candidate", "mesh", "held_out", "held_out_abs", "cpu_s", "light", "visibility", "specular", "chosen",
+)
 
 
 class Clock:
@@ -85,14 +87,14 @@ def measure(inputs: ClipInputs, clip: str, candidate: str, given: dict) -> list[
     seconds, appearance, shape = clock.seconds(), lit.settings.appearance, lit.shape_record
     facts = {
         "clip": clip,
-        "rung": candidate,
+        "candidate": candidate,
         "light": f"{appearance.light_model} {appearance.resolutions[-1]}",
         "visibility": "bounces" if appearance.bounce and appearance.visibility else appearance.visibility,
         "specular": appearance.specular,
     }
     judged = ~lit.capture.fitted
     if candidate == "auto":
-        facts["chosen"] = " > ".join(f"{row['part']} {row['rung']}" for row in lit.candidates if row["climbed"])
+        facts["chosen"] = " > ".join(f"{row['part']} {row['candidate']}" for row in lit.candidates if row["accepted"])
     rows = [{**facts, "mesh": "refined" if shape["refined"] else "tracked", **errors_of(lit.solution, judged),
              "cpu_s": seconds}]
     if lit.tracked is not None:
@@ -111,13 +113,13 @@ def compare(rows: Sequence[dict]) -> list[dict]:
     result = []
     for clip in dict.fromkeys(row["clip"] for row in rows):
         own = [row for row in rows if row["clip"] == clip]
-        autos, fixed = ([row for row in own if (row["rung"] == "auto") == is_auto] for is_auto in (True, False))
+        autos, fixed = ([row for row in own if (row["candidate"] == "auto") == is_auto] for is_auto in (True, False))
         if autos and fixed:
             best, auto = min(fixed, key=lambda row: float(row["held_out_abs"])), autos[-1]
             least_square = min(float(row["held_out"]) for row in fixed)
             result.append({
                 "clip": clip,
-                "best_fixed": f"{best['rung']}, {best['mesh']}",
+                "best_fixed": f"{best['candidate']}, {best['mesh']}",
                 "auto": ", ".join(f"{key} {auto[key]}" for key in ("light", "visibility", "specular", "mesh")),
                 "error_ratio": float(auto["held_out_abs"]) / float(best["held_out_abs"]),
                 "square_ratio": float(auto["held_out"]) / least_square,
@@ -157,11 +159,11 @@ def main(arguments: list[str] | None = None) -> int:
     for run in options.runs:
         inputs = read_inputs(run / "work" / "sample_frames", run / "work" / "track_landmarks")
         for candidate in options.candidates:
-            if any(row["clip"] == run.name and row["rung"] == candidate for row in rows):
+            if any(row["clip"] == run.name and row["candidate"] == candidate for row in rows):
                 continue
             rows += measure(inputs, run.name, candidate, given)
             write_rows(options.out, rows)
-            for row in [row for row in rows if (row["clip"], row["rung"]) == (run.name, candidate)]:
+            for row in [row for row in rows if (row["clip"], row["candidate"]) == (run.name, candidate)]:
                 print(run.name, candidate, f"{row['mesh']} {row['held_out_abs']:.5f} {row['cpu_s']:.1f} s", flush=True)
     compared = compare(rows)
     for row in compared:
