@@ -82,7 +82,8 @@ def eight_bit(codes: np.ndarray) -> np.ndarray:
 
 
 def build_clip(job: Job, frames, used: np.ndarray, landmarks_px: np.ndarray, given_poses: np.ndarray | None):
-    """Contrast pictures and unusable pixels of the frames with a face."""
+    """Contrast pictures and unusable pixels of the frames with a face. used [F] int: positions of those frames;
+    given_poses [F, 4, 4] mm or None."""
     from concurrent.futures import ThreadPoolExecutor
 
     from shared.tracking.tracked_clip import TrackedClip, face_width, pictures_of
@@ -131,7 +132,8 @@ def read_settings(job: Job, focal_known: bool):
 
 
 def excluded_frames(frames, used: np.ndarray, presence: np.ndarray, reasons: list[str]) -> list[dict]:
-    """Every frame that got no pose, with its reason."""
+    """Every frame that got no pose, with its reason. used [F] int: positions of the frames with a face; presence
+    [F], 0 to 1."""
     of_used = dict(zip(used.tolist(), reasons, strict=True))
     excluded = []
     for i in range(frames.count):
@@ -142,7 +144,7 @@ def excluded_frames(frames, used: np.ndarray, presence: np.ndarray, reasons: lis
 
 
 def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[dict]) -> dict:
-    """tracking.json; its warnings also go to the log."""
+    """tracking.json; its warnings also go to the log. fits [F] bool: frames that got a pose."""
     from shared.geometry.transforms import rotation_range_deg
     from shared.tracking.track_quality import rotation_deviation_deg, warnings_of
 

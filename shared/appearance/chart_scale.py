@@ -65,7 +65,7 @@ class ChartTransfer:
     def log_factor(self, radiance: np.ndarray, skin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How much brighter the light along the directions [D, 3] should be: log factor [3], its covariance [3, 3].
 
-        skin [3]: radiance of the head.
+        skin [3]: radiance of the head. radiance [D, 3] linear: the light along the directions.
         """
         count = self.cosine.shape[1]
         unit = 4.0 / len(radiance)

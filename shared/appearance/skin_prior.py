@@ -108,14 +108,14 @@ class SkinPull:
     colour: np.ndarray
 
     def __call__(self, log_albedo: np.ndarray) -> np.ndarray:
-        """The cost's gradient [3, P], linear in log_albedo."""
+        """The cost's gradient [3, P], linear in log_albedo [3, P]."""
         means = self.average @ log_albedo.T
         bright = means.mean(1, keepdims=True)
         pull = self.brightness @ bright / 3.0 + self.colour @ (means - bright)
         return (self.average.T @ pull).T
 
     def cost(self, log_albedo: np.ndarray) -> float:
-        """Half the squared deviations."""
+        """Half the squared deviations of log_albedo [3, P]."""
         return 0.5 * float((log_albedo * self(log_albedo)).sum())
 
 

@@ -60,7 +60,7 @@ class Noise:
     relative: float = 0.03
 
     def precision(self, colours: np.ndarray) -> np.ndarray:
-        """Inverse variance, the shape of colours."""
+        """Inverse variance of colours [n, 3], linear, in their shape."""
         return 1.0 / np.square(self.absolute + self.relative * colours)
 
 
@@ -74,7 +74,7 @@ class TexelMaterial:
     information: np.ndarray
 
     def radiance(self, rows: np.ndarray, irradiance: np.ndarray, reflection: np.ndarray) -> np.ndarray:
-        """a E + s S of the texels rows [n]; E, S [n, 3] -> [n, 3] float32."""
+        """a E + s S of the texels rows [n]; irradiance E [n, 3], reflection S [n, 3] -> [n, 3] float32."""
         sent = np.empty(irradiance.shape, np.float32)
         _radiance(self.albedo, self.specular, rows, irradiance, reflection, sent)
         return sent
@@ -163,7 +163,7 @@ class NormalEquations:
 
     def independent_share(self, typical_albedo: np.ndarray, systematic: np.ndarray) -> np.ndarray:
         """[T, 3]: how much of their weight errors that all frames share leave to the equations, among those of other
-        lights."""
+        lights. typical_albedo [3]; systematic [T, 3]: variance of the log albedo that all frames share."""
         precision = self.ee * np.square(self._bounded_albedo(typical_albedo)) / CORRELATED_FRAMES
         return 1.0 / (1.0 + precision * systematic)
 

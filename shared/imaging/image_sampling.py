@@ -62,13 +62,13 @@ class Samples:
     towards_camera: np.ndarray
 
     def frames(self, index: np.ndarray) -> Samples:
-        """The samples of some frames."""
+        """The samples of some frames, index [n] int or bool."""
         return Samples(
             self.colours[:, index], self.weight[:, index], self.saturation[:, index], self.towards_camera[:, index]
         )
 
     def points(self, index: np.ndarray) -> Samples:
-        """The samples of some points."""
+        """The samples of some points, index [n] int or bool."""
         return Samples(self.colours[index], self.weight[index], self.saturation[index], self.towards_camera[index])
 
 

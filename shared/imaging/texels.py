@@ -64,7 +64,7 @@ class TexelSurface:
         return float(np.median(self._texel_mm))
 
     def interpolate(self, values: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """Vertex values [V, C] at some texels, None: at all -> [n, C] float32."""
+        """Vertex values [V, C] at some texels, None: at all -> [n, C] float32. rows [n] int: numbers of texels."""
         rows = np.arange(len(self)) if rows is None else rows
         found = np.empty((len(rows), values.shape[1]), np.float32)
         _interpolate(self._corners, self.bary, rows, np.ascontiguousarray(values, np.float32), found)
@@ -77,7 +77,8 @@ class TexelSurface:
         return image.reshape((self.size, self.size) + values.shape[1:])
 
     def dilated(self, image: np.ndarray) -> np.ndarray:
-        """The gutters around the charts take the nearest texel's value, so that filtering never reads background."""
+        """The gutters around the charts take the nearest texel's value, so that filtering never reads background.
+        image [size, size, ...]."""
         empty, nearest = self._gutters
         filled = image.copy()
         filled.reshape((-1,) + image.shape[2:])[empty] = image.reshape((-1,) + image.shape[2:])[nearest]

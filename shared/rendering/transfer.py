@@ -41,7 +41,7 @@ class Points:
         return len(self.positions)
 
     def take(self, index: np.ndarray) -> Points:
-        """The points at index."""
+        """The points index [n] int."""
         return Points(self.positions[index], self.normals[index])
 
 

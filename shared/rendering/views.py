@@ -243,6 +243,7 @@ class HeadViews:
 
 
 def clip_light(envmap: np.ndarray, camera_from_head: np.ndarray, moves: str) -> np.ndarray:
-    """The recovered light as the head saw it when it looked into the camera: lat-long in head space."""
+    """The recovered light as the head saw it when it looked into the camera: lat-long in head space. envmap [H, W,
+    3] linear."""
     turned = world_from_head(camera_from_head[None, frontal_frame(camera_from_head)], moves)[0]
     return light_in_head_space(envmap, turned)

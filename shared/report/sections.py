@@ -133,7 +133,7 @@ def map_section(maps: Mapping[str, np.ndarray]) -> str:
 
 
 def map_picture(name: str, values: np.ndarray) -> tuple[np.ndarray, float]:
-    """-> uint8 picture of a map and the value that is shown as white."""
+    """-> uint8 picture of a map and the value that is shown as white. values [H, W] or [H, W, 3]."""
     if name == "confidence":
         return viridis_bytes(values, 0.0, 1.0), 1.0
     if name == "normal":
@@ -152,6 +152,7 @@ _CHART = (
 
 def light_section(envmap: np.ndarray, chart: np.ndarray | None = None) -> str:
     """The environment map as exposed and four stops darker, and the colour chart [H, W, 3] sRGB where one is in view.
+    envmap [H, W, 3] linear.
     """
     picture = shrunk(envmap, LIGHT_PIXELS)
     pictures = "".join(
@@ -181,7 +182,7 @@ def pose_section(content: ReportContent | ClipContent) -> str:
 
 
 def tracking_section(overlay: np.ndarray | None) -> str:
-    """Mesh and landmarks over a frame."""
+    """Mesh and landmarks over a frame: overlay [H, W, 3] uint8."""
     if overlay is None:
         return "<p>The tracking stage left no overlay.</p>"
     picture = jpeg_uri(shrunk(overlay, OVERLAY_PIXELS))

@@ -16,7 +16,7 @@ _NOTHING = 90
 
 
 def shape_section(sheet: np.ndarray | None) -> str:
-    """The refined mesh beside the tracked one. sheet: as of shape_pictures.shape_sheet."""
+    """The refined mesh beside the tracked one. sheet [H, W, 3] uint8: as of shape_pictures.shape_sheet."""
     if sheet is None:
         return "<p>inverse_render left no picture of the shape.</p>"
     caption = (

@@ -108,13 +108,14 @@ class Trial:
 
 
 def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
-    """By how much the errors [H] of the same frames fell in the mean, and the standard error of that."""
+    """By how much the errors of the same frames, before [H] and after [H], fell in the mean, and the standard error
+    of that."""
     falls = before - after
     return float(falls.mean()), float(falls.std(ddof=1) / np.sqrt(len(falls)))
 
 
 def serves(before: np.ndarray, after: np.ndarray, worthwhile: float = WORTHWHILE) -> bool:
-    """Whether errors [H] fell by more than chance, and by more than a share of them."""
+    """Whether errors, before [H] and after [H], fell by more than chance, and by more than a share of them."""
     fall, standard_error = gain(before, after)
     return fall > max(standard_error, worthwhile * float(before.mean()))
 

@@ -101,7 +101,8 @@ def grid_from_mesh(
     reference: int,
     scale: float,
 ) -> SurfaceGrid:
-    """What the reference camera [4, 4] sees of the mesh within box (x0, y0, x1, y1 px); usable_face [F] bool."""
+    """What the reference camera [4, 4] sees of the mesh within box (x0, y0, x1, y1 px); usable_face [F] bool. box
+    [4] px."""
     zoomed = np.array(intrinsics, np.float64)
     zoomed[:2] *= scale
     zoomed[:2, 2] -= np.asarray(box[:2]) * scale
@@ -209,6 +210,6 @@ def _lookup(field: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def points_on_grid(grid: SurfaceGrid, where: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """The surface's points [N, 3] at grid places [N, 2] (row, column)."""
+    """The surface's points [N, 3] at grid places, where [N, 2] (row, column)."""
     corners = grid.corners[where[:, 0], where[:, 1]]
     return interpolate(vertices, corners, np.arange(len(corners)), grid.bary[where[:, 0], where[:, 1]])
