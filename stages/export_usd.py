@@ -211,7 +211,8 @@ def write_lights(job: Job, writer, envmap, clips: list) -> None:
 
 
 def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
-    """The content of run.json: what each stage was told, what it took, what it found."""
+    """The content of run.json: what each stage was told, what it took, what it found. own_seconds: what this stage
+    took so far."""
     from shared.geometry.mesh_checks import mesh_warnings
     from shared.report.gather import own_record, selection_record, stage_record, warnings_of
 

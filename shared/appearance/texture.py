@@ -252,7 +252,8 @@ def robust_weight(
     inactive.
 
     information [T]: precision of the model's log albedo; what it leaves open does not lower a sample's weight; shadow
-    [n, 3]: standard deviation of the model since borders of shadows may lie elsewhere; None: of none.
+    [n, 3]: standard deviation of the model since borders of shadows may lie elsewhere; None: of none. scale: of the
+    Cauchy loss, in standard deviations.
     """
     shadow, weight = np.zeros_like(model) if shadow is None else shadow, np.empty_like(model)
     numbers = np.array([noise.absolute, noise.relative, PRIOR_SPREAD**-2, scale**-2], np.float32)
@@ -282,7 +283,7 @@ def pooled_specular(
 ) -> np.ndarray:
     """Intensity [T]: the equations summed over a Gaussian of width texels, with a normal prior.
 
-    Infinite width: one value everywhere, the prior's mean.
+    Infinite width: one value everywhere, the prior's mean. mean, sigma: of the prior.
     """
     if not np.isfinite(width):
         return np.full(len(surface), mean, np.float32)

@@ -98,6 +98,7 @@ def place_frame(
 
 
 def sample(image: np.ndarray, layout: np.ndarray, method: int = cv2.INTER_LINEAR, outside: float = 0) -> np.ndarray:
-    """Values of an image [H, W, ...] at positions layout [h, w, 2] in pixels with centres at + 0.5."""
+    """Values of an image [H, W, ...] at positions layout [h, w, 2] in pixels with centres at + 0.5. outside: the
+    value beyond the image."""
     x, y = layout[..., 0].astype(np.float32) - 0.5, layout[..., 1].astype(np.float32) - 0.5
     return cv2.remap(image, x, y, method, borderMode=cv2.BORDER_CONSTANT, borderValue=outside)

@@ -71,7 +71,7 @@ class TexelSurface:
         return found
 
     def to_image(self, values: np.ndarray, elsewhere: float = 0.0) -> np.ndarray:
-        """[T, ...] -> [size, size, ...]."""
+        """[T, ...] -> [size, size, ...]. elsewhere: the value of all other texels."""
         image = np.full((self.size**2,) + values.shape[1:], elsewhere, values.dtype)
         image[self.pixel] = values
         return image.reshape((self.size, self.size) + values.shape[1:])

@@ -115,7 +115,8 @@ def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
 
 
 def serves(before: np.ndarray, after: np.ndarray, worthwhile: float = WORTHWHILE) -> bool:
-    """Whether errors, before [H] and after [H], fell by more than chance, and by more than a share of them."""
+    """Whether errors, before [H] and after [H], fell by more than chance, and by more than a share of them.
+    worthwhile: that share."""
     fall, standard_error = gain(before, after)
     return fall > max(standard_error, worthwhile * float(before.mean()))
 

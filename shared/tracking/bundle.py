@@ -223,7 +223,7 @@ class BundleProblem:
         return ReducedSystem(matrix, rhs, coupling, half_inverse, point_rhs)
 
     def step(self, state: BundleState, system: ReducedSystem, damping: float) -> BundleState:
-        """Solves the damped camera system, then each point for itself."""
+        """Solves the damped camera system, then each point for itself. damping: relative to the diagonal."""
         matrix = system.matrix + damping * np.diag(np.diag(system.matrix) + 1e-12)
         cameras = cho_solve(cho_factor(matrix, check_finite=False), system.rhs, check_finite=False)
         frames = len(state.poses)

@@ -1,4 +1,5 @@
-"""Arrays that public functions take: each has a shape in the docstring, or a name that means the same everywhere."""
+"""What public functions take: arrays have a shape in the docstring, numbers a word there, a unit in their name, or
+either has a name that means the same everywhere."""
 
 import ast
 import re
@@ -10,15 +11,16 @@ from tools.documents.readme import DOCS, README
 REPOSITORY = README.parent
 FILES = sorted(path for room in ("shared", "stages") for path in (REPOSITORY / room).rglob("*.py"))
 _ARRAY = re.compile(r"(np\.ndarray|torch\.Tensor)( \| None)?")
+_UNIT = re.compile(r"_(mm|px|deg|s|mb|texels|radians)$")
 _SHAPE = re.compile(r"\[[^\]]+\]")
 
 
 def shared_names():
-    """The names in the table of docs/architecture.md; each row states a shape."""
+    """The names in the table of docs/architecture.md; each row states a shape, or that it is a number."""
     text = (DOCS / "architecture.md").read_text(encoding="utf-8")
     table = text.partition("## Names that mean the same everywhere")[2].partition("\n## ")[0]
     rows = re.findall(r"^\| `(\w+)` \| (.+?) \|", table, re.MULTILINE)
-    assert all(_SHAPE.search(shape) for _, shape in rows)
+    assert len(rows) > 10 and all(_SHAPE.search(shape) or shape == "number" for _, shape in rows)
     return {name for name, _ in rows}
 
 
@@ -37,6 +39,14 @@ def undocumented(function, docstring, of_class=""):
     before = own.partition("->")[0] if "->" in own else ""
     spare = len(_SHAPE.findall(before)) - sum(has_shape(name, before) for name in arrays)
     return missing if len(missing) > spare else []
+
+
+def unnamed_numbers(function, docstring, of_class=""):
+    """Parameters that are floats, whose name states no unit and which neither docstring mentions."""
+    arguments = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    floats = [a.arg for a in arguments if a.annotation and re.fullmatch(r"float( \| None)?", ast.unparse(a.annotation))]
+    mentioned = set(re.findall(r"\w+", f"{docstring} {of_class}")) | shared_names()
+    return [name for name in floats if name not in mentioned and not _UNIT.search(name)]
 
 
 def public_functions(tree):
@@ -59,8 +69,15 @@ def test_the_check_sees_what_is_missing(text, missing):
     assert undocumented(function, text) == missing
 
 
+def test_the_check_sees_unnamed_numbers():
+    function = ast.parse("def f(width: float, edge_mm: float, roughness: float, far: float | None): pass").body[0]
+    assert unnamed_numbers(function, "far: px.") == ["width"]
+
+
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(REPOSITORY).as_posix())
-def test_arrays_have_shapes(path):
-    functions = public_functions(ast.parse(path.read_bytes()))
-    found = {f"{f.name}:{f.lineno}": undocumented(f, ast.get_docstring(f) or "", of_class) for of_class, f in functions}
+def test_arrays_have_shapes_and_numbers_a_meaning(path):
+    found = {}
+    for of_class, function in public_functions(ast.parse(path.read_bytes())):
+        texts = ast.get_docstring(function) or "", of_class
+        found[f"{function.name}:{function.lineno}"] = undocumented(function, *texts) + unnamed_numbers(function, *texts)
     assert {where: names for where, names in found.items() if names} == {}
