@@ -206,7 +206,7 @@ def test_table_and_chart_show_every_row(toy, tmp_path):
     command.main([str(tmp_path), "--docs", str(tmp_path / "docs")])
     with open(tmp_path / "docs" / "stress.csv", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert [(r["dial"], r["severity"], r["verdict"]) for r in rows] == [
+    assert [(r["perturbation"], r["severity"], r["verdict"]) for r in rows] == [
         ("toy", "0", RIGHT), ("toy", "1", WARNED), ("toy", "2", SILENT), ("other", "0", RIGHT), ("other", "1", RIGHT)]
     page = (tmp_path / "docs" / "stress.md").read_text()
     assert "| a toy | 2 units |" in page and "**99**" in page

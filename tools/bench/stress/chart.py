@@ -25,7 +25,7 @@ _STYLE = (
 
 def write_chart(rows: Sequence[dict], path: Path) -> None:
     """rows: of stress.verdicts, in order, perturbation by perturbation."""
-    panels = [_panel(list(own)) for _, own in groupby(rows, key=lambda row: row["dial"].name)]
+    panels = [_panel(list(own)) for _, own in groupby(rows, key=lambda row: row["perturbation"].name)]
     lines = -(-len(panels) // _COLUMNS)
     width, height = _COLUMNS * _WIDTH, lines * _HEIGHT + 60
     placed = [f'<g transform="translate({k % _COLUMNS * _WIDTH} {k // _COLUMNS * _HEIGHT})">{panel}</g>'
@@ -39,7 +39,7 @@ def write_chart(rows: Sequence[dict], path: Path) -> None:
 
 def _panel(rows: list[dict]) -> str:
     """One perturbation: the axes, a curve a score, a square a severity in the colour of its verdict."""
-    perturbation, count = rows[0]["dial"], len(rows)
+    perturbation, count = rows[0]["perturbation"], len(rows)
     across = _LEFT + 8 + np.arange(count) * (_PLOT[0] - 16) / max(count - 1, 1)
     parts = [f'<text class="name" x="{_LEFT}" y="14">{escape(perturbation.name.replace("_", " "))}</text>']
     for power in range(int(_LOWEST), int(_HIGHEST) + 1):

@@ -95,8 +95,8 @@ def verdicts(work: Path) -> list[dict]:
     for perturbation in PERTURBATIONS:
         known = ((severity, known_row(work, perturbation.make(severity))) for severity in perturbation.severities)
         found = [(0.0, zero)] + [(severity, row) for severity, row in known if row]
-        rows += [{"dial": perturbation, "severity": severity, **row, "verdict": judge(perturbation.says, row, zero)}
-                 for severity, row in found if len(found) > 1]
+        rows += [{"perturbation": perturbation, "severity": severity, **row,
+                  "verdict": judge(perturbation.says, row, zero)} for severity, row in found if len(found) > 1]
     return rows
 
 
@@ -134,7 +134,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     if rows:
         write_tables(rows, missing_cases(options.work), options.docs or options.work, code_version())
-    bad = [f"{row['dial'].name} {row['severity']:g}" for row in rows if row["verdict"].word in (SILENT, FAILED)]
+    bad = [f"{row['perturbation'].name} {row['severity']:g}" for row in rows if row["verdict"].word in (SILENT, FAILED)]
     print(f"{len(rows)} rows; wrong and silent, or failed: {', '.join(bad) or 'none'}"
           + "; not complete: call again to go on" * (not complete))
     return 1 if bad else 0

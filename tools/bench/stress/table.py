@@ -10,7 +10,7 @@ from tools.bench.stress.chart import write_chart
 from tools.bench.stress.verdict import CONFIDENT, FAILED, LIMITS, SILENT, is_wrong
 
 _SHOWN = (*LIMITS, *CONFIDENT.values(), "confident_share", "specular_bias", "roughness_bias", "log_scale")
-_COLUMNS = ("dial", "severity", "unit", "verdict", "wrong", "said", *_SHOWN, "gates_missed", "warnings", "exit",
+_COLUMNS = ("perturbation", "severity", "unit", "verdict", "wrong", "said", *_SHOWN, "gates_missed", "warnings", "exit",
             "seconds", "code")
 
 
@@ -28,7 +28,7 @@ def write_tables(rows: Sequence[dict], missing: Sequence[str], folder: Path, cod
 def _csv_row(row: dict) -> dict:
     verdict, scores = row["verdict"], row["scores"]
     return {
-        "dial": row["dial"].name, "severity": f"{row['severity']:g}", "unit": row["dial"].unit,
+        "perturbation": row["perturbation"].name, "severity": f"{row['severity']:g}", "unit": row["perturbation"].unit,
         "verdict": verdict.word, "wrong": " ".join(verdict.wrong), "said": "; ".join(verdict.said),
         **{name: f"{scores[name]:.4g}" for name in _SHOWN if name in scores},
         "gates_missed": "; ".join(row["missed_gates"]), "warnings": "; ".join(row["warnings"]), "exit": row["exit"],
@@ -56,7 +56,7 @@ def _page(rows: Sequence[dict], missing: Sequence[str], code: str) -> list[str]:
         "wrong. Gates that the case at 0 misses, which do not count: "
         f"{'; '.join(rows[0]['missed_gates']) or 'none'}.",
         "",
-        "| dial | severity | " + " | ".join(LIMITS) + " | verdict | what Limn said |",
+        "| perturbation | severity | " + " | ".join(LIMITS) + " | verdict | what Limn said |",
         "|---|---|" + "---|" * len(LIMITS) + "---|---|",
         *(_line(row, zero, row["code"] != code) for row in rows if row["severity"]),
     ]
@@ -68,7 +68,7 @@ def _page(rows: Sequence[dict], missing: Sequence[str], code: str) -> list[str]:
 
 
 def _line(row: dict, zero: dict, old: bool) -> str:
-    verdict, scores, perturbation = row["verdict"], row["scores"], row["dial"]
+    verdict, scores, perturbation = row["verdict"], row["scores"], row["perturbation"]
     cells = []
     for name in LIMITS:
         value = scores.get(name)
