@@ -211,7 +211,8 @@ def write_lights(job: Job, writer, envmap, clips: list) -> None:
 
 
 def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
-    """The content of run.json: what each stage was told, what it took, what it found."""
+    """The content of run.json: what each stage was told, what it took, what it found. own_seconds: what this stage
+    took so far."""
     from shared.geometry.mesh_checks import mesh_warnings
     from shared.report.content import own_record, selection_record, stage_record, warnings_of
 
@@ -229,7 +230,7 @@ def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     kept = ("model", "residuals", "albedo_scale", "held_out_frames", "clips")
     chosen = {key: solve[key] for key in kept if key in solve}
     if selection := selection_record(job.input("inverse_render"), solve):
-        chosen["ladder"] = selection
+        chosen["model_selection"] = selection
     return {
         "subject": job.subject.name,
         "stages": records,

@@ -25,12 +25,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from shared.contract import Job, Output, Parameter, ParameterGroup, Stage, main
-from shared.contract.records import LADDER_TIMES, MESH, SOLVE, SOLVED_POSES
+from shared.contract.records import MESH, SELECTION_TIMES, SOLVE, SOLVED_POSES
 from shared.errors import InputError, LimnError
 
 SOLVERS = ("transfer", "reference")
 MODELS = ("full", "auto")
-SELECTION_SECONDS = "ladder_seconds.json"
+SELECTION_SECONDS = "model_selection_seconds.json"
 LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
 PUBLISHED = ParameterGroup(
@@ -62,7 +62,7 @@ PUBLISHED = ParameterGroup(
 
 STAGE = Stage(
     name="inverse_render",
-    version=19,
+    version=20,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -82,7 +82,7 @@ STAGE = Stage(
                optional=True),
         Output("solve.json", "model, residuals, steps, scale of the albedo, held-out frames, warnings", fields=SOLVE),
         Output(SELECTION_SECONDS, "what each candidate of solve.json's model selection took (model=auto)", unit="s",
-               volatile=True, optional=True, fields=LADDER_TIMES),
+               volatile=True, optional=True, fields=SELECTION_TIMES),
     ),
     parameters=(
         Parameter("map_size", int, 1024, "Edge of the maps; a power of two.", "texels",
@@ -122,7 +122,7 @@ STAGE = Stage(
         Parameter("silhouette", bool, True, "Before the solve, move ears, skull and jaw so that the outline meets the "
                   "person mask's border."),
         Parameter("shape_subdivisions", int, 1, "Times that the mesh is subdivided for that.", "", 0, 2),
-        Parameter("shape_rounds", int, 2, "Most steps of the shape per level.", "", 1, 20),
+        Parameter("shape_steps", int, 2, "Most steps of the shape per level.", "", 1, 20, former="shape_rounds"),
         Parameter("shape_frames", int, 48, "Frames that the shape is solved from, spread evenly.", "frames", 3, 1000),
         Parameter("shape_smoothness", float, 19.0, "Lambda of the large steps: over how many edges, squared, the "
                   "surface moves together.", "", 0.0, 10000.0),
@@ -261,7 +261,7 @@ def run(job: Job) -> None:
     record |= own[0]
     if job.clips:
         record["clips"] = [clip | frames for clip, frames in zip(placed, own, strict=True)]
-    if candidates := record.get("ladder"):
+    if candidates := record.get("model_selection"):
         write_json(job.out / SELECTION_SECONDS, [candidate.pop("seconds") for candidate in candidates])
     write_json(job.out / "solve.json", record)
 

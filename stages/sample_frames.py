@@ -23,7 +23,7 @@ from shared.errors import InputError, LimnError
 
 STAGE = Stage(
     name="sample_frames",
-    version=4,
+    version=5,
     help="Decode the clip, choose good frames evenly in time, crop them to the head and mask the person.",
     inputs=(),
     models=FACE_NETWORKS,
@@ -206,7 +206,7 @@ def check(job: Job) -> None:
 
 
 def check_frame(frames, i: int, codes: np.ndarray, mask: np.ndarray) -> None:
-    """Sizes, mask values, and a face that is not of one colour."""
+    """Sizes, mask values, and a face that is not of one colour. mask [H, W] uint8."""
     size = frames.size[::-1]
     require(codes.shape == (*size, 3) and mask.shape == size, f"{frames.files[i]}: wrong size")
     require(set(np.unique(mask).tolist()) <= {0, 128, FACE}, f"{frames.mask_files[i]}: values besides 0, 128, 255")

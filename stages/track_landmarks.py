@@ -44,11 +44,13 @@ STAGE = Stage(
         Parameter("warp_width", float, 320.0, "Width of the face in the flow's pictures.", "px", 100.0, 2000.0),
         Parameter("fine_passes", int, 1, "Passes over the finest detail.", "", 1, 6),
         Parameter("tracks", int, 5000, "Skin points tracked against the mean texture.", "points", 100, 20000),
-        Parameter("texel", float, 1.0, "Texels of the mean texture.", "px", 0.5, 8.0),
-        Parameter("window", float, 5.0, "Standard width of the windows that are matched.", "texels", 1.5, 30.0),
+        Parameter("texel_px", float, 1.0, "Edge of the mean texture's texels.", "px", 0.5, 8.0, former="texel"),
+        Parameter("window_sigma", float, 5.0, "Standard width of the windows that are matched.", "texels", 1.5, 30.0,
+                  former="window"),
         Parameter("point_sigma", float, 10.0, "Deviation of track points about the fitted head.", "mm", 0.01, 1000.0,
                   former="point_prior"),
-        Parameter("fit", str, "robust", "Weights of the head fit.", choices=("robust", "published")),
+        Parameter("head_fit", str, "robust", "Weights of the head model's fit.", choices=("robust", "published"),
+                  former="fit"),
         Parameter("stiffness", float, 20.0, "Stiffness of the free shape, per noise over relief.", "", 0.01, 1e6),
         Parameter("min_confidence", float, 0.5, "Landmark network's confidence below which a frame is lost.", "", 0, 1,
                   former="least_presence"),
@@ -80,7 +82,8 @@ def eight_bit(codes: np.ndarray) -> np.ndarray:
 
 
 def build_clip(job: Job, frames, used: np.ndarray, landmarks_px: np.ndarray, given_poses: np.ndarray | None):
-    """Contrast pictures and unusable pixels of the frames with a face."""
+    """Contrast pictures and unusable pixels of the frames with a face. used [F] int: positions of those frames;
+    given_poses [F, 4, 4] mm or None."""
     from concurrent.futures import ThreadPoolExecutor
 
     from shared.tracking.tracked_clip import TrackedClip, face_width, pictures_of
@@ -120,16 +123,17 @@ def read_settings(job: Job, focal_known: bool):
         start_frames=params.start_frames,
         fine_passes=params.fine_passes,
         tracks=params.tracks,
-        texel_px=params.texel,
-        window_sigma=params.window,
+        texel_px=params.texel_px,
+        window_sigma=params.window_sigma,
         prior_mm=params.point_sigma,
         estimate_focal=not focal_known,
-        fit=PUBLISHED if params.fit == "published" else FitWeights(stiffness=params.stiffness),
+        fit=PUBLISHED if params.head_fit == "published" else FitWeights(stiffness=params.stiffness),
     )
 
 
 def excluded_frames(frames, used: np.ndarray, presence: np.ndarray, reasons: list[str]) -> list[dict]:
-    """Every frame that got no pose, with its reason."""
+    """Every frame that got no pose, with its reason. used [F] int: positions of the frames with a face; presence
+    [F], 0 to 1."""
     of_used = dict(zip(used.tolist(), reasons, strict=True))
     excluded = []
     for i in range(frames.count):
@@ -140,7 +144,7 @@ def excluded_frames(frames, used: np.ndarray, presence: np.ndarray, reasons: lis
 
 
 def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[dict]) -> dict:
-    """tracking.json; its warnings also go to the log."""
+    """tracking.json; its warnings also go to the log. fits [F] bool: frames that got a pose."""
     from shared.geometry.transforms import rotation_range_deg
     from shared.tracking.track_quality import rotation_deviation_deg, warnings_of
 

@@ -109,7 +109,8 @@ def scale_prior(
 
 
 def most_likely_irradiance(log_radiance: np.ndarray, white_sigma: float = WHITE_SIGMA) -> np.ndarray:
-    """u [3]: the log mean irradiance that the priors alone prefer for skin of log mean radiance y [3]."""
+    """u [3]: the log mean irradiance that the priors alone prefer for skin of log mean radiance y [3]. log_radiance
+    [3]."""
     matrix, right = scale_prior(log_radiance, white_sigma)
     return np.linalg.lstsq(matrix, right, rcond=None)[0]
 

@@ -33,7 +33,7 @@ from shared.rendering.envmap import cube_lookup
 CORNER_SIGMA_PX = 0.3
 JITTERS = 12
 LEAST_COSINE = 0.4
-"""Of the angle between normal and line of sight: a chart turned further away has gloss and no safe normal."""
+"""Of the angle between normal and line of sight: a chart turned further away shows its own reflection too strongly."""
 DEPTHS_MM = np.array([-150.0, -110.0, -80.0, -60.0, -40.0, -20.0, 0.0, 20.0, 45.0, 75.0, 110.0])
 """Of the chart, relative to the head's origin between the ears, away from the camera; traced at these, and linear
 between them in steps of STEP_MM."""
@@ -65,7 +65,7 @@ class ChartTransfer:
     def log_factor(self, radiance: np.ndarray, skin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How much brighter the light along the directions [D, 3] should be: log factor [3], its covariance [3, 3].
 
-        skin [3]: radiance of the head.
+        skin [3]: radiance of the head. radiance [D, 3] linear: the light along the directions.
         """
         count = self.cosine.shape[1]
         unit = 4.0 / len(radiance)
@@ -77,8 +77,8 @@ class ChartTransfer:
         weight = (self.observation.weight / self.observation.white**2)[:, None]
         factor, glare, variance = _line(reference * direct, value, weight,
                                         (GLARE_SIGMA * self.observation.white) ** -2.0)
-        misfit = weight * (value - factor[:, None] * reference * direct - glare[:, None]) ** 2
-        error = misfit.sum((1, 3)) + ((glare / (GLARE_SIGMA * self.observation.white)) ** 2).sum(-1)
+        squared_error = weight * (value - factor[:, None] * reference * direct - glare[:, None]) ** 2
+        error = squared_error.sum((1, 3)) + ((glare / (GLARE_SIGMA * self.observation.white)) ** 2).sum(-1)
         freedom = max(int((weight > 0).sum()) - 3, 1)
         variance_inflation = max(1.0, float(error.min()) / freedom)
         expected = ((_depths() - LIKELY_DEPTH_MM) / DEPTH_SIGMA_MM)[:, None]

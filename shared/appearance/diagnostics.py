@@ -45,7 +45,8 @@ LEAST_MODEL = 0.01
 def face_regions(
     mesh: Mesh, face_segment: np.ndarray | None, segment_names: tuple[str, ...], positions: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """{"eyes", "forehead"} -> [P] bool: which points [P, 3] on the skin lie around the eyes, and on the forehead."""
+    """{"eyes", "forehead"} -> [P] bool: which points [P, 3] on the skin lie around the eyes, and on the forehead.
+    face_segment [F] int; positions [P, 3] mm."""
     if face_segment is None or "eyes" not in segment_names:
         return {}
     eyes = mesh.vertices[mesh.faces[face_segment == segment_names.index("eyes")].ravel()]

@@ -43,7 +43,7 @@ def uv_tangents(mesh: Mesh, normals: np.ndarray, face: np.ndarray, bary: np.ndar
     """[n, 2, 3] float32 at places on faces [n] with corner weights [n, 3]: unit directions of growing u and v.
 
     normals [n, 3] unit. The faces' directions of u are averaged at each texture vertex and made orthogonal to the
-    normal at the place; the second direction is normal x first, turned to where v grows.
+    normal at the place; the second direction is normal x first, turned to where v grows. face [n] int; bary [n, 3].
     """
     corners, uv = mesh.vertices[mesh.faces], mesh.uvs[mesh.face_uvs]
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -70,7 +70,8 @@ class ReliefEquations:
         """What share of the turns [T, 2] of all texels, 0 to 1, lowers the cost, and by how much.
 
         patch [T] int: texels whose errors go together. What they say of the slope scatters; of it one standard
-        deviation is taken off, so that relief which noise alone would confirm as often as not is none.
+        deviation is taken off, so that relief which noise alone would confirm as often as not is none. turn [T, 2]
+        radians.
         """
         (a11, a12, a22), (k1, k2) = self.hessian.T.astype(np.float64), turn.T.astype(np.float64)
         curvature = float((a11 * k1**2 + 2.0 * a12 * k1 * k2 + a22 * k2**2).sum())
@@ -103,7 +104,7 @@ class ReliefSums:
         self.per_channel, self.together = np.zeros((texels, 12), np.float32), np.zeros((texels, 5), np.float32)
 
     def add(self, samples: LinearSamples, residual: np.ndarray) -> None:
-        """Samples with the residuals [n, 3] to explain."""
+        """Samples with the residual [n, 3] to explain, linear."""
         _add_products(
             samples.rows, samples.irradiance, samples.derivative, residual, samples.weight, self.per_channel,
             self.together
@@ -157,7 +158,7 @@ class NormalPass:
         return turn, record | {"median_deg": float(typical), "p95_deg": float(large)}
 
     def accumulate(self, frames: np.ndarray) -> ReliefEquations:
-        """The equations of some frames."""
+        """The equations of some frames [n] int, numbers of views."""
         sums = ReliefSums(len(self.surface))
         for view in read_ahead(map(self.view, self.progress(frames, "fine normals"))):
             self._add(view, sums)
@@ -169,8 +170,8 @@ class NormalPass:
         pose, picture, lens = views.camera_from_head[f], views.picture(f), views.intrinsics[f]
         view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
         slope = self.vectors.frames(slice(f, f + 1))[:, 0]
-        gloss, gloss_slope = self.reflections.at(f, shading.points.normals)
-        of_points = np.concatenate([gloss, slope.reshape(-1, 9), gloss_slope.reshape(-1, 9)], axis=1)
+        reflection, reflection_slope = self.reflections.at(f, shading.points.normals)
+        of_points = np.concatenate([reflection, slope.reshape(-1, 9), reflection_slope.reshape(-1, 9)], axis=1)
         values = np.concatenate([shading.irradiance(f), of_points[shading.stand_in]], axis=1)
         return self.surface.frame_view(view, picture, lens, values)
 
@@ -243,9 +244,9 @@ def _differentiate(rows, values, albedo, specular, tangents, derivative):
 def _add_to_corners(corner, weight, scale, error, total, sums):
     for i in range(len(corner)):
         for c in range(3):
-            trust = weight[i, c] * scale[i, c]
-            total[corner[i], c] += trust * scale[i, c]
-            sums[corner[i], c] += trust * error[i, c]
+            weighted = weight[i, c] * scale[i, c]
+            total[corner[i], c] += weighted * scale[i, c]
+            sums[corner[i], c] += weighted * error[i, c]
 
 
 @compiled

@@ -83,7 +83,7 @@ class StepReport:
 
     def record(self, model: str, resolution: int, number: int, phase: Phase) -> dict:
         """The line of solve.json: step number of a phase under a light of a model and resolution."""
-        several = {"light_trust": list(self.light_weights)} if self.light_weights else {}
+        several = {"light_weights": list(self.light_weights)} if self.light_weights else {}
         return several | {
             "fitted": self.fitted,
             "held_out": self.held_out,

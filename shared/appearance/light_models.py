@@ -85,7 +85,8 @@ class LogLight:
         return cost, self._log_adjoint(gradient), lambda change: self._log_adjoint(product(self._log(change)))
 
     def fit(self, radiance: np.ndarray) -> np.ndarray:
-        """Parameters whose light comes closest to a cubemap of any resolution, in the logarithm -> [M, 3]."""
+        """Parameters whose light comes closest to a cubemap radiance [6 m^2, 3] of any resolution, in the logarithm
+        -> [M, 3]."""
         log_light = np.log(resample_light(radiance, self.resolution))
         if self.basis is None:
             return log_light
@@ -97,7 +98,7 @@ class LampLight:
     """A lobe on a smooth sky: exp(sky) + exp(lamp) * exp(sharpness (d.w - 1)).
 
     Parameters [M + 1 (+ 1), 3]: the sky's (a LogLight of some basis), the log colour of the lamp, and, unless the
-    direction is given, the direction d itself as the last row, of any length.
+    direction [3] is given, the direction d itself as the last row, of any length.
     """
 
     def __init__(self, sky: LogLight, direction: np.ndarray | None = None, sharpness: float = LAMP_SHARPNESS):
@@ -161,7 +162,8 @@ class LampLight:
         return cost + 0.5 * float((away * (lamp - lamp.mean())).sum()), result, whole
 
     def fit(self, radiance: np.ndarray) -> np.ndarray:
-        """The lamp takes what exceeds the median of a cubemap around its brightest direction, the sky the rest."""
+        """The lamp takes what exceeds the median of a cubemap around its brightest direction, the sky the rest.
+        radiance [6 m^2, 3] linear."""
         fine = resample_light(radiance, self.resolution)
         solid = cube_solid_angles(self.resolution)[:, None]
         median = np.median(fine, axis=0)
@@ -231,7 +233,8 @@ class SeveralLights:
         return np.concatenate([share * part for share, part in zip(self.shares, parts, strict=True)])
 
     def fit(self, radiance: np.ndarray) -> np.ndarray:
-        """Parameters whose lights come closest to cubemaps of any resolution, one below the other -> [L M, 3]."""
+        """Parameters whose lights come closest to cubemaps radiance [L 6 m^2, 3] of any resolution, one below the
+        other -> [L M, 3]."""
         return self._each(self.model.fit, radiance)
 
 

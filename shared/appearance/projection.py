@@ -83,7 +83,7 @@ class SpecularFit:
     linearised about; weight [3, P, F] of the samples, evidence: see SampleErrors.
 
     best: the intensity and, where it is sought, the change of the log roughness; unlikely: what the priors say against
-    them; highlights [3, P, F]: theirs.
+    them; highlights [3, P, F]: theirs. slope [3, P, F]: derivative of the reflection by the log roughness.
     """
 
     def __init__(

@@ -93,7 +93,7 @@ class SampleErrors:
 
     def spread(self, error: torch.Tensor, inactive: torch.Tensor, frames: slice | np.ndarray = slice(None)) -> float:
         """Variance of errors [3, P, F] over the assumed noise's, by their median, in all frames or in some; inactive
-        [3, P, F] bool: those that don't count."""
+        [3, P, F] bool: those that don't count. error [3, P, F]."""
         used = ((self.view_weight > 0) & ~inactive)[..., frames]
         return max(float(error[..., frames][used].median()), 0.05) / 0.4549
 

@@ -60,13 +60,13 @@ class SkinPrior:
         even, odd = 0.5 * (here + across), 0.5 * (here - across)
         self.covariance = even + variation.odd**2 * odd
 
-    def at(self, log_albedo: np.ndarray, trust: np.ndarray) -> SkinPull:
-        """The prior near log_albedo [3, P], its points weighed by trust [P] in 0 .. 1 and by how far they lie from
+    def at(self, log_albedo: np.ndarray, weight: np.ndarray) -> SkinPull:
+        """The prior near log_albedo [3, P], its points weighted by weight [P] in 0 .. 1 and by how far they lie from
         their patch."""
-        trust, brightness = trust[self.points], log_albedo[:, self.points].mean(0)
-        middle = self._mean(trust)[0] @ brightness
+        weight, brightness = weight[self.points], log_albedo[:, self.points].mean(0)
+        middle = self._mean(weight)[0] @ brightness
         away = (brightness - middle[self.patch]) / self.variation.brightness_texture
-        mean, open_share = self._mean(trust / _distrust(away**2))
+        mean, open_share = self._mean(weight / _variance_inflation(away**2))
         average = mean @ sparse.csr_matrix(
             (np.ones(len(self.points)), (np.arange(len(self.points)), self.points)),
             (len(self.points), log_albedo.shape[1]),
@@ -87,7 +87,7 @@ class SkinPrior:
         for _ in range(_REWEIGHTED):
             precision = _free_mean(sigma**2 * self.covariance + np.diag(noise * outlying))
             off = noise[:, None] * outlying[:, None] * (precision @ values) / texture
-            outlying = _distrust(np.square(off).mean(1))
+            outlying = _variance_inflation(np.square(off).mean(1))
         return _free_mean(sigma**2 * self.covariance + np.diag(noise * outlying))
 
     def _mean(self, weight: np.ndarray) -> tuple[sparse.csr_matrix, np.ndarray]:
@@ -108,18 +108,18 @@ class SkinPull:
     colour: np.ndarray
 
     def __call__(self, log_albedo: np.ndarray) -> np.ndarray:
-        """The cost's gradient [3, P], linear in log_albedo."""
+        """The cost's gradient [3, P], linear in log_albedo [3, P]."""
         means = self.average @ log_albedo.T
         bright = means.mean(1, keepdims=True)
         pull = self.brightness @ bright / 3.0 + self.colour @ (means - bright)
         return (self.average.T @ pull).T
 
     def cost(self, log_albedo: np.ndarray) -> float:
-        """Half the squared deviations."""
+        """Half the squared deviations of log_albedo [3, P]."""
         return 0.5 * float((log_albedo * self(log_albedo)).sum())
 
 
-def _distrust(squared: np.ndarray) -> np.ndarray:
+def _variance_inflation(squared: np.ndarray) -> np.ndarray:
     """Factor on the variance of what lies so many textures off, squared."""
     return np.square(1.0 + squared / _OUTLYING**2)
 

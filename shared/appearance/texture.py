@@ -60,7 +60,7 @@ class Noise:
     relative: float = 0.03
 
     def precision(self, colours: np.ndarray) -> np.ndarray:
-        """Inverse variance, the shape of colours."""
+        """Inverse variance of colours [n, 3], linear, in their shape."""
         return 1.0 / np.square(self.absolute + self.relative * colours)
 
 
@@ -74,7 +74,7 @@ class TexelMaterial:
     information: np.ndarray
 
     def radiance(self, rows: np.ndarray, irradiance: np.ndarray, reflection: np.ndarray) -> np.ndarray:
-        """a E + s S of the texels rows [n]; E, S [n, 3] -> [n, 3] float32."""
+        """a E + s S of the texels rows [n]; irradiance E [n, 3], reflection S [n, 3] -> [n, 3] float32."""
         sent = np.empty(irradiance.shape, np.float32)
         _radiance(self.albedo, self.specular, rows, irradiance, reflection, sent)
         return sent
@@ -148,22 +148,22 @@ class NormalEquations:
     def highlight_variance(self, specular: float | np.ndarray) -> np.ndarray:
         """[T, 3] of the log albedo, since highlights of intensity `specular`, one or [T], are wrong by HIGHLIGHT_ERROR
         of themselves: little where they are a small share of what a texel sends out, all of it in hair that the model
-        gives a skin's gloss."""
+        gives a skin's specular intensity."""
         share = np.reshape(specular, (-1, 1)) * self.es / np.maximum(self.ei, 1e-9)
         return np.square(HIGHLIGHT_ERROR * share / np.maximum(1.0 - share, LEAST_MATTE_SHARE))
 
     def _bounded_albedo(self, typical_albedo: np.ndarray) -> np.ndarray:
         return np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)
 
-    def scale(self, trust: float) -> None:
-        """All weights times that."""
-        if trust != 1.0:
-            self.sums *= trust
-            self.clipped_ee *= trust
+    def scale(self, factor: float) -> None:
+        """All weights times factor."""
+        if factor != 1.0:
+            self.sums *= factor
+            self.clipped_ee *= factor
 
-    def trusted_share(self, typical_albedo: np.ndarray, systematic: np.ndarray) -> np.ndarray:
+    def independent_share(self, typical_albedo: np.ndarray, systematic: np.ndarray) -> np.ndarray:
         """[T, 3]: how much of their weight errors that all frames share leave to the equations, among those of other
-        lights."""
+        lights. typical_albedo [3]; systematic [T, 3]: variance of the log albedo that all frames share."""
         precision = self.ee * np.square(self._bounded_albedo(typical_albedo)) / CORRELATED_FRAMES
         return 1.0 / (1.0 + precision * systematic)
 
@@ -191,7 +191,7 @@ def weigh_lights(
     whole = NormalEquations(len(information), parts[0].noise)
     left = np.zeros_like(information)
     for own, error in zip(parts, systematic, strict=True):
-        share = own.trusted_share(typical_albedo, error)
+        share = own.independent_share(typical_albedo, error)
         whole.sums += own.sums * np.tile(share, PRODUCTS)
         whole.clipped_ee += own.clipped_ee * share
         left += np.square(own.ee * share) * error
@@ -226,8 +226,8 @@ def _add_samples(
         for c in range(3):
             colour, e, s = colours[i, c], irradiance[i, c], reflection[i, c]
             sigma, border = absolute + relative * colour, shadow[i, c]
-            trust = weight[i] / (sigma * sigma + border * border)
-            weighted = trust * robust[i, c]
+            precision = weight[i] / (sigma * sigma + border * border)
+            weighted = precision * robust[i, c]
             sums[row, c] += weighted * e * e
             sums[row, 3 + c] += weighted * e * s
             sums[row, 6 + c] += weighted * e * colour
@@ -237,7 +237,7 @@ def _add_samples(
             if saturation[i, c] == 0:
                 sums[row, 15 + c] += weighted * e * e
             elif saturation[i, c] > 0:
-                clipped_ee[row, c] += trust * e * e
+                clipped_ee[row, c] += precision * e * e
 
 
 def robust_weight(
@@ -251,8 +251,9 @@ def robust_weight(
     """Cauchy weight [n, 3] of each sample given the model [n, 3]; 0 where a clipped or crushed sample's bound is
     inactive.
 
-    information [T]: precision of the model's log albedo; what it leaves open is no reason to distrust a sample; shadow
-    [n, 3]: standard deviation of the model since borders of shadows may lie elsewhere; None: of none.
+    information [T]: precision of the model's log albedo; what it leaves open does not lower a sample's weight; shadow
+    [n, 3]: standard deviation of the model since borders of shadows may lie elsewhere; None: of none. scale: of the
+    Cauchy loss, in standard deviations.
     """
     shadow, weight = np.zeros_like(model) if shadow is None else shadow, np.empty_like(model)
     numbers = np.array([noise.absolute, noise.relative, PRIOR_SPREAD**-2, scale**-2], np.float32)
@@ -282,7 +283,7 @@ def pooled_specular(
 ) -> np.ndarray:
     """Intensity [T]: the equations summed over a Gaussian of width texels, with a normal prior.
 
-    Infinite width: one value everywhere, the prior's mean.
+    Infinite width: one value everywhere, the prior's mean. mean, sigma: of the prior.
     """
     if not np.isfinite(width):
         return np.full(len(surface), mean, np.float32)

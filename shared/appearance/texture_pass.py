@@ -81,7 +81,9 @@ class TexturePass:
         self.typical_albedo = typical_albedo
         lights = views.frames_of_lights
         self.light_weights = tuple(light_weights) or (1.0,) * len(lights)
-        self.systematic = [self._systematic(own) / trust for own, trust in zip(lights, self.light_weights, strict=True)]
+        self.systematic = [
+            self._systematic(own) / weight for own, weight in zip(lights, self.light_weights, strict=True)
+        ]
         self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), context.progress
         self.region = region
 
@@ -118,8 +120,8 @@ class TexturePass:
         for f, view in zip(frames, ahead, strict=True):
             part, border = parts[self.views.light_index[f]], borders[self.views.light_index[f]]
             self._share_out(view, lambda lit, part=part, border=border: self._add(material, part, border, lit))
-        for part, trust in zip(parts, self.light_weights, strict=True):
-            part.scale(trust)
+        for part, weight in zip(parts, self.light_weights, strict=True):
+            part.scale(weight)
         systematic = [error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
                       + part.highlight_variance(self.specular)
                       for error, border, part in zip(self.systematic, borders, parts, strict=True)]
@@ -161,14 +163,14 @@ class TexturePass:
         rough = [equations.solve_albedo(specular, 0.0, 1e-6) for specular in intensities]
         around = self._surroundings(rough, information).astype(np.float32)
         certain = information / (1.0 + information)
-        trusted = (PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + systematic)).mean(1)
+        determined = (PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + systematic)).mean(1)
         pull = _ALBEDO_PULL + equations.ee * (systematic / PRIOR_SPREAD**2)
         found = []
         for k, specular in enumerate(intensities):
             smooth = np.exp(self.surface.interpolate(around[..., k]))
             # A texel's brightness by its certain channels, its colour otherwise the neighbourhood's.
             brighter = (certain * np.log(np.maximum(rough[k], 1e-3) / smooth)).sum(1) / (certain.sum(1) + 0.3)
-            albedo = equations.solve_albedo(specular, smooth * np.exp(brighter * trusted)[:, None], pull)
+            albedo = equations.solve_albedo(specular, smooth * np.exp(brighter * determined)[:, None], pull)
             found.append(TexelMaterial(albedo, specular, information.min(1)))
         return found
 
@@ -203,7 +205,7 @@ class TexturePass:
         return smooth_field(self.surface.mesh, means, known, centre, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD, self.region)
 
     def held_out_errors(self, candidates: list[TexelMaterial]) -> list[float]:
-        """Root mean square residual of each candidate on the held-out frames (linear, censored, trust-weighted)."""
+        """Root mean square residual of each candidate on the held-out frames (linear, censored, weighted)."""
         sums = np.zeros(1 + len(candidates))
         frames = self.progress(np.nonzero(~self.views.fitted)[0], "texture, held-out frames")
         for view in read_ahead(map(self.view, frames)):

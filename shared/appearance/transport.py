@@ -95,13 +95,14 @@ class Transport:
         return result
 
     def render_adjoint(self, values: torch.Tensor, albedo: torch.Tensor, specular: float) -> np.ndarray:
-        """Transpose of render: values [3, P, F] -> [K, 3]."""
+        """Transpose of render: values [3, P, F], albedo [3, P, 1] -> [K, 3]."""
         return self.frame_light.adjoint(self._along_adjoint(values, albedo, specular).contiguous().numpy())
 
     def render_adjoint_with_slopes(
         self, values: torch.Tensor, albedo: torch.Tensor, specular: float, slopes: LobeSlopes, amplitude: float
     ) -> np.ndarray:
-        """The same for a rendering that has highlights of these slopes, too, times an amplitude."""
+        """The same for a rendering that has highlights of these slopes, too, times an amplitude. values [3, P, F];
+        albedo [3, P, 1]."""
         along = self._along_adjoint(values, albedo, specular) + amplitude * reflect_transposed(slopes.weights, values)
         return self.frame_light.adjoint(along.contiguous().numpy())
 

@@ -62,7 +62,7 @@ class BackgroundMotion:
         self._start, self._face = 0, None
 
     def follow(self, luma: np.ndarray) -> None:
-        """The next frame, uint8 [H, W]: where the key frame's corners are now."""
+        """The next frame, luma [H, W] uint8: where the key frame's corners are now."""
         if len(self._corners):
             guess = self._places.copy()
             places, found, _ = cv2.calcOpticalFlowPyrLK(self._key, _small(luma), self._corners, guess,
@@ -72,7 +72,7 @@ class BackgroundMotion:
     def set_key(self, position: int, luma: np.ndarray, background: np.ndarray, face: np.ndarray) -> None:
         """Ends the stretch at this frame, which was followed already, and begins the next.
 
-        background: bool [H, W], where no person is. face: landmarks [468, 3] px.
+        background: bool [H, W], where no person is. face: landmarks [468, 3] px. luma [H, W] uint8.
         """
         small = _small(luma)
         if len(self._corners):

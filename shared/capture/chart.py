@@ -32,27 +32,27 @@ camera's primaries and the light's spectrum are not those of the table."""
 FLOOR = 0.004
 """Deviation that no patch goes below, relative to a white diffuser: what glare and noise leave on dark patches."""
 GLARE_SIGMA = 0.02
-"""Expected constant part of all patches (the surface's gloss, flare of the lens), relative to a white diffuser."""
+"""Expected constant part of all patches (specular reflection, flare of the lens), relative to a white diffuser."""
 SLOPE_SIGMA = 0.3
 """Expected change of the light from the chart's middle to its edge, relative: a head beside it takes that much."""
 LEAST_SIGMA = 0.01
-LARGEST_MISFIT, LARGEST_COLOURED_MISFIT = 0.1, 0.4
+LARGEST_NEUTRAL_ERROR, LARGEST_COLOURED_ERROR = 0.1, 0.4
 FEWEST_NEUTRALS = 3
 
 
 @dataclass(frozen=True)
 class ChartFit:
     """white [3]: radiance that a white diffuser in the middle of the chart would have, which is the irradiance over pi;
-    sigma [3]: standard deviation of its logarithm; glare [3]: the constant part; trust [24] in 0 .. 1: how well each
-    patch agrees with the others; misfit, coloured_misfit: relative deviation (root mean square) of the neutral and of
-    the coloured patches; fault: why it should not be used, or empty."""
+    sigma [3]: standard deviation of its logarithm; glare [3]: the constant part; weight [24] in 0 .. 1: how well each
+    patch agrees with the others; neutral_error, coloured_error: relative deviation (root mean square) of the neutral
+    and of the coloured patches; fault: why it should not be used, or empty."""
 
     white: np.ndarray
     sigma: np.ndarray
     glare: np.ndarray
-    trust: np.ndarray
-    misfit: float
-    coloured_misfit: float
+    weight: np.ndarray
+    neutral_error: float
+    coloured_error: float
     fault: str = ""
 
 
@@ -74,11 +74,11 @@ class ChartObservation:
     @classmethod
     def from_record(cls, record: dict, crop: tuple[float, float, float], frame_index: np.ndarray) -> ChartObservation:
         """From chart_watch.ChartWatch.record; crop: (x0, y0, scale) of the pictures; frame_index [F] of the poses."""
-        clipped, trust = np.array(record["clipped"], bool), np.array(record["trust"])[:, None]
+        clipped, robust = np.array(record["clipped"], bool), np.array(record["weight"])[:, None]
         return cls(
             corners=(np.array(record["corners"]) - crop[:2]) * crop[2],
             values=np.array(record["patches"]),
-            weight=usable(clipped) * trust / patch_sigma() ** 2,
+            weight=usable(clipped) * robust / patch_sigma() ** 2,
             white=np.array(record["white"]),
             log_sigma=np.array(record["log_sigma"]),
             frame=int(np.abs(np.asarray(frame_index) - record["frame_index"]).argmin()),
@@ -126,10 +126,10 @@ def fit_chart(patches: np.ndarray, clipped: np.ndarray) -> ChartFit:
         fault = "its grey patches are overexposed: expose darker"
     elif not (white > 0).all():
         fault = "its patches do not follow their reflectances"
-    elif neutral > LARGEST_MISFIT:
+    elif neutral > LARGEST_NEUTRAL_ERROR:
         fault = (f"its grey patches deviate by {neutral:.0%} from their reflectances: it is shaded in part, or "
                  "colour.transfer is wrong")
-    elif coloured > LARGEST_COLOURED_MISFIT:
+    elif coloured > LARGEST_COLOURED_ERROR:
         fault = f"its coloured patches deviate by {coloured:.0%} from their reflectances"
     return ChartFit(white, np.maximum(sigma, LEAST_SIGMA), glare, robust.min(1), neutral, coloured, fault)
 

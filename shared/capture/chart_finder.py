@@ -80,7 +80,7 @@ def read_chart(linear: np.ndarray, limit: float, corners: np.ndarray) -> ChartDe
 
 
 def clipping_limit(table: np.ndarray) -> float:
-    """Linear value above which a channel counts as clipped; table: linear value of every code."""
+    """Linear value above which a channel counts as clipped; table [K]: linear value of each of the K codes."""
     return float(table[int(np.ceil(CLIPPED_CODE * (len(table) - 1)))])
 
 

@@ -89,7 +89,7 @@ class ChartWatch:
     def record(self) -> list[dict]:
         """The frames in which the chart can be used, as ChartObservation.from_record reads them: frame_index; corners
         [4, 2] source px; patches [24, 3] linear values, clipped [24, 3] (1 where one only says "at least"); white,
-        log_sigma, glare [3], trust [24] and misfit (neutral, coloured) of ChartFit; pitch_px."""
+        log_sigma, glare [3], weight [24] and relative_error (neutral, coloured) of ChartFit; pitch_px."""
         return [{
             "frame_index": int(index),
             "corners": np.round(view.corners, 2).tolist(),
@@ -99,8 +99,8 @@ class ChartWatch:
             "white": np.round(fit.white, 5).tolist(),
             "log_sigma": np.round(fit.sigma, 4).tolist(),
             "glare": np.round(fit.glare, 5).tolist(),
-            "trust": np.round(fit.trust, 3).tolist(),
-            "misfit": [round(fit.misfit, 4), round(fit.coloured_misfit, 4)],
+            "weight": np.round(fit.weight, 3).tolist(),
+            "relative_error": [round(fit.neutral_error, 4), round(fit.coloured_error, 4)],
         } for index, view, fit in self._used]
 
     def warnings(self) -> list[str]:

@@ -142,7 +142,8 @@ class ClipSurvey:
     def head_boxes(self, positions: np.ndarray) -> np.ndarray:
         """[N, 4] px: the whole head at positions where the main face was seen.
 
-        Between the frames with a person mask, hair is taken to move with the face.
+        Between the frames with a person mask, hair is taken to move with the face. positions [N] int: of the frames
+        fed.
         """
         face = self.main_face
         faces = np.stack([landmark_box(face.observations[int(i)]) for i in positions])
@@ -159,7 +160,8 @@ class ClipSurvey:
         return contradiction([s for s in self._motion.stretches if all(sound[s.start:s.end + 1])], moves)
 
     def background_drift(self, positions: np.ndarray, width: int, height: int) -> float:
-        """See frame_quality.background_drift; background is what no head or body ever covers at `positions`."""
+        """See frame_quality.background_drift; background is what no head or body ever covers at `positions`.
+        positions [N] int: of the frames fed."""
         still, face = np.ones((PROXY_HEIGHT, PROXY_WIDTH), bool), self.main_face
         for i in positions:
             x0, y0, x1, _ = head_window(face.observations[int(i)], width, height)

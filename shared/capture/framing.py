@@ -44,17 +44,19 @@ def landmark_box(points: np.ndarray) -> np.ndarray:
 
 
 def face_height(points: np.ndarray) -> float:
-    """Length from hairline to chin, px, for landmarks [468, >=2]."""
+    """Length from hairline to chin, px; points [468, >=2] px: landmarks."""
     return float(np.linalg.norm(points[FOREHEAD, :2] - points[CHIN, :2]))
 
 
 def skull_box(points: np.ndarray) -> np.ndarray:
-    """[4]: x0, y0, x1, y1 px, the tightest that a bald head without its neck can be, for landmarks [468, >=2]."""
+    """[4]: x0, y0, x1, y1 px, the tightest that a bald head without its neck can be; points [468, >=2] px:
+    landmarks."""
     return landmark_box(points) + face_height(points) * np.array([0.0, -0.2, 0.0, 0.0])
 
 
 def head_window(points: np.ndarray, width: int, height: int) -> tuple[int, int, int, int]:
-    """Square x0, y0, x1, y1 around head and shoulders, cut at the picture's edges: what the person mask should see."""
+    """Square x0, y0, x1, y1 around head and shoulders, cut at the picture's edges: what the person mask should see.
+    points [468, >=2] px; width, height: of the picture, px."""
     box, half = landmark_box(points), WINDOW_HEIGHTS / 2 * face_height(points)
     centre = (box[:2] + box[2:]) / 2
     low = np.clip(np.floor(centre - half), 0, (width - 1, height - 1)).astype(int)
@@ -99,7 +101,8 @@ def own_region(person: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 
 def interpolate_offsets(index: np.ndarray, known_index: np.ndarray, known_offsets: np.ndarray) -> np.ndarray:
-    """[N, 4] from [K, 4] known at rising positions, linear in between."""
+    """[N, 4] from [K, 4] known at rising positions, linear in between. index [N] and known_index [K]: positions;
+    known_offsets [K, 4] px."""
     return np.stack([np.interp(index, known_index, known_offsets[:, side]) for side in range(4)], axis=1)
 
 

@@ -92,7 +92,8 @@ class FaceNetworks:
         return self.track(rgb, points)
 
     def track(self, rgb: np.ndarray, previous: np.ndarray) -> tuple[float, np.ndarray]:
-        """As `landmarks`, with the crop taken from landmarks [468, >=2] of the frame before: no detection."""
+        """As `landmarks`, with the crop taken from landmarks [468, >=2] of the frame before: no detection. previous
+        [468, >=2] px."""
         low, high = previous[:, :2].min(axis=0), previous[:, :2].max(axis=0)
         eyes = previous[EYE_CORNERS_LEFT[0], :2] - previous[EYE_CORNERS_RIGHT[0], :2]
         crop = _crop_to_image((low + high) / 2, float(np.max(high - low)), eyes)
@@ -105,7 +106,7 @@ class FaceNetworks:
 
         previous: landmarks of a neighbouring frame, or None. They only tell which of several faces is meant, and stand
         in where the detector finds none: what they would add to the crop, the frame would inherit from its neighbour,
-        and a clip run backwards would be tracked otherwise.
+        and a clip run backwards would be tracked otherwise. previous [468, >=2] px.
         """
         faces = self.detect(rgb)
         if previous is not None and len(faces) > 1:
@@ -250,7 +251,8 @@ def _suppress(detections: list[Detection], max_overlap: float = 0.3) -> list[Det
 
 
 def box_overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """Shared area of two boxes [4] (x0, y0, x1, y1) over the smaller one's: a nested box counts as the same face."""
+    """Shared area of two boxes a [4] and b [4] (x0, y0, x1, y1) over the smaller one's: a nested box counts as the
+    same face."""
     sides = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
     smaller = min(np.prod(a[2:] - a[:2]), np.prod(b[2:] - b[:2]))
     return float(np.prod(np.maximum(sides, 0)) / max(smaller, 1e-9))

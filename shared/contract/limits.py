@@ -62,7 +62,8 @@ class Limits:
         return self.memory_mb is not None or self.minutes is not None
 
     def fault(self, memory_mb: float, minutes: float) -> str:
-        """What is wrong and how to raise the limit; "" as long as all is well."""
+        """What is wrong and how to raise the limit; "" as long as all is well. memory_mb, minutes: what it took so
+        far."""
         raise_it = f"{FACTOR}=2 doubles the limits, 0 lifts them; for good: resources in pipeline.yaml"
         if self.memory_mb is not None and memory_mb > self.memory_mb:
             return f"ended, since it took more memory than its limit of {self.memory_mb:.0f} MB; {raise_it}"

@@ -57,8 +57,8 @@ FRAMES = (
     Field("chart[].white", "Irradiance over pi on the chart.", shape="3"),
     Field("chart[].log_sigma", "Standard deviation of its logarithm.", shape="3"),
     Field("chart[].glare", "Linear value that a reflection adds to every patch.", shape="3"),
-    Field("chart[].trust", "Weight of each patch, 0 to 1.", shape="24"),
-    Field("chart[].misfit", "Relative error of the grey patches and of the coloured ones.", shape="2"),
+    Field("chart[].weight", "Weight of each patch, 0 to 1.", shape="24"),
+    Field("chart[].relative_error", "Relative error of the grey patches and of the coloured ones.", shape="2"),
     Field("warnings", "What is wrong with the clip, one sentence each.", "text", "N"),
 )
 
@@ -130,13 +130,13 @@ INIT = (
 
 SOLVED_POSES = (POSES, FRAME_INDEX, SOURCE_LENS, CROP_LENS)
 _REFERENCE = "solver=reference only:"
-_LADDER = (
+_CANDIDATES = (
     Field("part", "Part of the model.", "text"),
-    Field("rung", "The choice that was tried for it.", "text"),
+    Field("candidate", "The choice that was tried for it.", "text"),
     Field("held_out", "Error on the held-out frames."),
     Field("fall", "By how much that is less than before.", "number or null"),
     Field("standard_error", "Standard error of the fall.", "number or null"),
-    Field("climbed", "Whether the choice was kept.", "bool"),
+    Field("accepted", "Whether the choice was kept.", "bool"),
 )
 
 
@@ -216,17 +216,17 @@ SOLVE = (
     Field("relief.pooled_texels", "Standard width over which texels count together.", unit="texels", optional=True),
     Field("relief.median_deg", "Median turn.", unit="deg", optional=True),
     Field("relief.p95_deg", "What 95 % of the turns stay below.", unit="deg", optional=True),
-    Field("signs", "Signs of what the model cannot follow; absent with solver=reference.", "", optional=True),
-    Field("signs.frame_gain", "Standard deviation of the brightness from frame to frame."),
-    Field("signs.frame_tint", "The same of the colour, red against blue."),
-    Field("signs.albedo_by_orientation", "Standard deviation of the log albedo that follows the surface's "
+    Field("diagnostics", "What the model cannot follow, measured; absent with solver=reference.", "", optional=True),
+    Field("diagnostics.frame_gain", "Standard deviation of the brightness from frame to frame."),
+    Field("diagnostics.frame_tint", "The same of the colour, red against blue."),
+    Field("diagnostics.albedo_by_orientation", "Standard deviation of the log albedo that follows the surface's "
           "orientation."),
-    Field("signs.unlikely_colour", "How unlikely the colour of skin and light is, in standard deviations."),
-    Field("signs.covered_eyes", "Share of the skin around the eyes that fits far worse than the face; absent for a "
-          "mesh without segments.", optional=True),
-    Field("signs.covered_forehead", "The same of the forehead.", optional=True),
-    Field("ladder", "With model=auto: one entry for each choice that was tried, in order.", "", optional=True),
-    *_under("ladder[]", _LADDER),
+    Field("diagnostics.unlikely_colour", "How unlikely the colour of skin and light is, in standard deviations."),
+    Field("diagnostics.covered_eyes", "Share of the skin around the eyes that fits far worse than the face; absent "
+          "for a mesh without segments.", optional=True),
+    Field("diagnostics.covered_forehead", "The same of the forehead.", optional=True),
+    Field("model_selection", "With model=auto: one entry for each choice that was tried, in order.", "", optional=True),
+    *_under("model_selection[]", _CANDIDATES),
     Field("iterations", "One entry for each step of the light; with solver=reference, for some of the iterations.", ""),
     Field("iterations[].light", "The light's model.", "text", optional=True),
     Field("iterations[].resolution", "Edge of its cubemap faces.", "int", unit="texels", optional=True),
@@ -241,7 +241,8 @@ SOLVE = (
     Field("iterations[].skin_prior", "The albedo's part of the cost.", optional=True),
     Field("iterations[].specular_intensity", "The typical specular intensity after it.", optional=True),
     Field("iterations[].roughness", "The typical roughness after it.", optional=True),
-    Field("iterations[].light_trust", "Of several clips: the weight of each clip's samples.", shape="C", optional=True),
+    Field("iterations[].light_weights", "Of several clips: the weight of each clip's samples.", shape="C",
+          optional=True),
     Field("iterations[].iteration", f"{_REFERENCE} number of the iteration, from 1.", "int", optional=True),
     *(Field(f"iterations[].{name}", f"{_REFERENCE} loss of {what}.", optional=True) for name, what in (
         ("image", "the picture"), ("mask", "the mask"), ("laplacian", "the vertices' Laplacian"),
@@ -255,7 +256,7 @@ SOLVE = (
     Field("warnings", "What is wrong with the clip or the result, one sentence each.", "text", "W"),
 )
 
-LADDER_TIMES = (Field("[]", "Seconds of each entry of `ladder` in solve.json, in order.", unit="s"),)
+SELECTION_TIMES = (Field("[]", "Seconds of each entry of `model_selection` in solve.json, in order.", unit="s"),)
 
 EXPORTED_POSES = (POSES, FRAME_INDEX, SOURCE_LENS)
 _STAGE_RECORD = (
@@ -275,9 +276,9 @@ RUN = (
     *_SCALE,
     Field("held_out_frames", "Frames of the (first) clip that were not fitted.", "int", "H"),
     *_CLIPS,
-    Field("ladder", "With model=auto: as in solve.json, and with the seconds of each.", "", optional=True),
-    *_under("ladder[]", _LADDER),
-    Field("ladder[].seconds", "Seconds that the choice took.", "number or null", unit="s"),
+    Field("model_selection", "With model=auto: as in solve.json, and with the seconds of each.", "", optional=True),
+    *_under("model_selection[]", _CANDIDATES),
+    Field("model_selection[].seconds", "Seconds that the choice took.", "number or null", unit="s"),
     Field("warnings", "All warnings.", ""),
     Field("warnings[].stage", "The stage that gave it; of several clips `<clip>/<stage>`.", "text"),
     Field("warnings[].text", "The warning.", "text"),

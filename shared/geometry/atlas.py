@@ -39,7 +39,8 @@ class Atlas:
 
 
 def build_atlas(mesh: Mesh, usable_face: np.ndarray, texel_mm: float, count: int) -> Atlas:
-    """Atlas of the usable faces [F] bool, texels of about texel_mm; about `count` are tracked, evenly spread."""
+    """Atlas of the usable faces [F] bool, texels of about texel_mm; about `count` are tracked, evenly spread.
+    usable_face [F] bool."""
     used = np.nonzero(usable_face)[0]
     uv = mesh.uvs[mesh.face_uvs[used]]
     first, second = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
@@ -97,6 +98,7 @@ def place_frame(
 
 
 def sample(image: np.ndarray, layout: np.ndarray, method: int = cv2.INTER_LINEAR, outside: float = 0) -> np.ndarray:
-    """Image values at positions [h, w, 2] in pixels with centres at + 0.5."""
+    """Values of an image [H, W, ...] at positions layout [h, w, 2] in pixels with centres at + 0.5. outside: the
+    value beyond the image."""
     x, y = layout[..., 0].astype(np.float32) - 0.5, layout[..., 1].astype(np.float32) - 0.5
     return cv2.remap(image, x, y, method, borderMode=cv2.BORDER_CONSTANT, borderValue=outside)

@@ -51,7 +51,7 @@ def move_without_crossing(start: np.ndarray, wanted: np.ndarray, faces: np.ndarr
     """Vertices [V, 3] as near to wanted as goes without crossings that start did not have and without turned faces.
 
     Where moved faces cross, turn over or lose nearly all area, the move of the vertices around is halved, at last
-    undone. Only edges near what has moved since the last look are followed.
+    undone. Only edges near what has moved since the last look are followed. start [V, 3] and wanted [V, 3]: mm.
     """
     edges, adjacency = mesh_edges(faces)[0], vertex_adjacency(faces, len(start))
     share, placed = np.ones(len(start)), start

@@ -226,7 +226,8 @@ def _rasterize(corners, face, bary):
 
 
 def segments_at(mesh: Mesh, face_segment: np.ndarray | None, positions: np.ndarray) -> np.ndarray | None:
-    """Segment [P] of the nearest vertices; None where the mesh has no segments."""
+    """Segment [P] of the vertices nearest to positions [P, 3] mm, from face_segment [F] int; None where the mesh has
+    no segments."""
     if face_segment is None:
         return None
     of_vertex = np.zeros(len(mesh.vertices), int)

@@ -22,7 +22,7 @@ class TrackPoints:
 
     @classmethod
     def tracked(cls, positions: np.ndarray, sigma_mm: np.ndarray) -> TrackPoints:
-        """Points [N, 3] mm with the deviation [N] that the adjustment states, and the floor under it."""
+        """Points [N, 3] mm with the deviation sigma_mm [N] that the adjustment states, and the floor under it."""
         return cls(positions, np.hypot(TRACK_FLOOR_MM, sigma_mm))
 
 

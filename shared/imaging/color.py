@@ -27,7 +27,7 @@ def decode_srgb(codes: np.ndarray) -> np.ndarray:
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear -> sRGB code values, clipped to [0, 1]."""
+    """linear [...] -> sRGB code values, clipped to [0, 1]."""
     linear = np.clip(linear, 0.0, 1.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
@@ -38,7 +38,7 @@ def decode_bt709(codes: np.ndarray) -> np.ndarray:
 
 
 def encode_bt709(linear: np.ndarray) -> np.ndarray:
-    """Linear -> code values of BT.709's camera curve, clipped to [0, 1]."""
+    """linear [...] -> code values of BT.709's camera curve, clipped to [0, 1]."""
     linear = np.clip(linear, 0.0, 1.0)
     return np.where(linear < 0.018, 4.5 * linear, 1.099 * np.maximum(linear, 1e-9) ** 0.45 - 0.099)
 
@@ -104,7 +104,7 @@ def linear_rec709_to_lab(rgb: np.ndarray) -> np.ndarray:
 
 
 def delta_e_2000(rgb_a: np.ndarray, rgb_b: np.ndarray) -> np.ndarray:
-    """CIEDE2000 between linear Rec.709 colours [..., 3] -> [...]."""
+    """CIEDE2000 between linear Rec.709 colours rgb_a [..., 3] and rgb_b [..., 3] -> [...]."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it misses matplotlib, which only its plots need
         from colour.difference import delta_E_CIE2000  # imports for a second; most callers never need it

@@ -1,6 +1,6 @@
-"""From frames to samples at surface points: what the camera sees of each point, and how far to trust it.
+"""From frames to samples at surface points: what the camera sees of each point, and what weight it gets.
 
-One frame at a time goes through, so memory does not grow with the clip. A sample is trusted by the square of its view
+One frame at a time goes through, so memory does not grow with the clip. A sample is weighted by the square of its view
 cosine and by its distance to the mask's border; points close to an occlusion edge count as hidden, since a small pose
 or shape error would read another surface there. Clipped and crushed channels are kept and marked: they say "at least"
 and "at most" (censored data), which still bounds the model.
@@ -62,13 +62,13 @@ class Samples:
     towards_camera: np.ndarray
 
     def frames(self, index: np.ndarray) -> Samples:
-        """The samples of some frames."""
+        """The samples of some frames, index [n] int or bool."""
         return Samples(
             self.colours[:, index], self.weight[:, index], self.saturation[:, index], self.towards_camera[:, index]
         )
 
     def points(self, index: np.ndarray) -> Samples:
-        """The samples of some points."""
+        """The samples of some points, index [n] int or bool."""
         return Samples(self.colours[index], self.weight[index], self.saturation[index], self.towards_camera[index])
 
 
@@ -207,7 +207,7 @@ def sample_saturation(saturation: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def sample_inside(picture: Picture, pixels: np.ndarray) -> np.ndarray:
-    """[N, 2] -> [N] float32 trust by distance from the mask's border, 0 outside."""
+    """[N, 2] -> [N] float32 weight by distance from the mask's border, 0 outside."""
     return remap(picture.inside, pixels, cv2.INTER_LINEAR)
 
 

@@ -66,7 +66,7 @@ class ClipDetail:
         self._seen: list[tuple[float, float, float]] = []
 
     def look(self, number: int, rgb: np.ndarray, inside: np.ndarray, height_px: float) -> None:
-        """Frame `number`: uint8 [H, W, 3] sRGB, the face's skin [H, W] bool, the face's height."""
+        """Frame `number`: uint8 [H, W, 3] sRGB, the face's skin, inside [H, W] bool, and the face's height, px."""
         if number % self._every == 0:
             self._seen.append((edge_width(rgb, inside), noise_share(rgb, inside), height_px))
 

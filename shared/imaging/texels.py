@@ -64,20 +64,21 @@ class TexelSurface:
         return float(np.median(self._texel_mm))
 
     def interpolate(self, values: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """Vertex values [V, C] at some texels, None: at all -> [n, C] float32."""
+        """Vertex values [V, C] at some texels, None: at all -> [n, C] float32. rows [n] int: numbers of texels."""
         rows = np.arange(len(self)) if rows is None else rows
         found = np.empty((len(rows), values.shape[1]), np.float32)
         _interpolate(self._corners, self.bary, rows, np.ascontiguousarray(values, np.float32), found)
         return found
 
     def to_image(self, values: np.ndarray, elsewhere: float = 0.0) -> np.ndarray:
-        """[T, ...] -> [size, size, ...]."""
+        """[T, ...] -> [size, size, ...]. elsewhere: the value of all other texels."""
         image = np.full((self.size**2,) + values.shape[1:], elsewhere, values.dtype)
         image[self.pixel] = values
         return image.reshape((self.size, self.size) + values.shape[1:])
 
     def dilated(self, image: np.ndarray) -> np.ndarray:
-        """The gutters around the charts take the nearest texel's value, so that filtering never reads background."""
+        """The gutters around the charts take the nearest texel's value, so that filtering never reads background.
+        image [size, size, ...]."""
         empty, nearest = self._gutters
         filled = image.copy()
         filled.reshape((-1,) + image.shape[2:])[empty] = image.reshape((-1,) + image.shape[2:])[nearest]
@@ -173,11 +174,11 @@ def _project(found, texel_mm, rows, focal_length, pixels, footprint):
 
 
 @compiled
-def _scatter(corners, weights, values, trust, sums, total):
+def _scatter(corners, weights, values, precision, sums, total):
     for t in range(len(corners)):
         for k in range(3):
             vertex, share = corners[t, k], weights[t, k]
             for c in range(values.shape[1]):
-                part = np.float64(share) * trust[t, c]
+                part = np.float64(share) * precision[t, c]
                 total[vertex, c] += part
                 sums[vertex, c] += part * values[t, c]

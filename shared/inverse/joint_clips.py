@@ -104,7 +104,7 @@ def fit_similarity(
 ) -> Similarity:
     """own ~ similarity(points [N, 3]) such that poses [F, 4, 4] of the own space show them at pixels [F, N, 2].
 
-    Robust Gauss-Newton (Cauchy); NaN: not seen.
+    Robust Gauss-Newton (Cauchy); NaN: not seen. camera_from_own [F, 4, 4] mm.
     """
     found = start
     for _ in range(ITERATIONS):

@@ -186,8 +186,8 @@ class _ClipSelection:
     def _report(self, record: dict) -> None:
         self.candidates.append(record)
         fall = "" if record["fall"] is None else f", {-record['fall']:+.6f} +- {record['standard_error']:.6f}"
-        said = "accepted" if record["climbed"] else "not accepted"
-        text = f"{record['part']} {record['rung']}: {record['held_out']:.6f} held out{fall}"
+        said = "accepted" if record["accepted"] else "not accepted"
+        text = f"{record['part']} {record['candidate']}: {record['held_out']:.6f} held out{fall}"
         self.context.note(f"model selection: {text}; {said} ({record['seconds']:.1f} s)")
 
     def selected(self) -> SelectedModel:

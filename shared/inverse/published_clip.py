@@ -211,7 +211,8 @@ def final_state(solver: ReferenceSolver, material: TexelMaterial, roughness: flo
 
 @torch.no_grad()
 def residual(views: Views, solver: ReferenceSolver, frames: np.ndarray) -> float:
-    """Root mean square error (linear) of its own renders inside the mask, over a few of the frames."""
+    """Root mean square error (linear) of its own renders inside the mask, over a few of the frames. frames [n] int:
+    numbers of views."""
     squared, generator, geometry = [], torch.Generator().manual_seed(0), solver.geometry()
     for f in frames[spread_frames(len(frames), JUDGED_FRAMES)]:
         picture, pose = views.picture(f), views.camera_from_head[f]

@@ -122,11 +122,11 @@ def solve_clip(
         "texture": texture_record,
         "shape": {**shape_record, "outline": outline},
         "relief": relief,
-        "signs": diagnostics,
+        "diagnostics": diagnostics,
         "warnings": [*filter(None, [chart_warning]), *scale_warnings(chart, typical),
                      *diagnostic_warnings(diagnostics, views.moves)],
         "albedo_scale": describe_scale(chart, typical),
-        "rungs": selected.candidates,
+        "model_selection": selected.candidates,
     }
     return InverseResult(
         solution, material, make_maps(texels, material, roughness, turn), shading, viewer, views.fitted, record
@@ -224,7 +224,7 @@ def describe_light(state) -> str:
 def summarise(result: InverseResult, moves: str) -> dict:
     """What solve.json says, but for which frames were rendered and held out; moves: the head or the camera."""
     solution, state = result.solution, result.solution.state
-    seen = result.material.information > 1.0
+    seen, tried = result.material.information > 1.0, result.record.get("model_selection")
     return {
         "model": {
             "light": describe_light(state),
@@ -239,8 +239,8 @@ def summarise(result: InverseResult, moves: str) -> dict:
             "held_out": solution.held_out,
             "texture_held_out": result.record["texture"]["held_out"],
         },
-        **{key: result.record[key] for key in ("shape", "relief", "signs") if key in result.record},
-        **({"ladder": [dict(candidate) for candidate in result.record["rungs"]]} if result.record.get("rungs") else {}),
+        **{key: result.record[key] for key in ("shape", "relief", "diagnostics") if key in result.record},
+        **({"model_selection": [dict(candidate) for candidate in tried]} if tried else {}),
         "iterations": list(solution.iterations),
         "albedo_scale": result.record["albedo_scale"],
         "seen_share_of_texels": round(float(seen.mean()), 4),
@@ -249,7 +249,7 @@ def summarise(result: InverseResult, moves: str) -> dict:
 
 
 def warnings_about(result: InverseResult) -> list[str]:
-    """What a person should know before trusting the maps."""
+    """What a person should know before using the maps."""
     found, solution = list(result.record["warnings"]), result.solution
     if solution.held_out > 1.3 * solution.fitted:
         found.append(

@@ -82,12 +82,13 @@ def match_textures(first: ClipTexture, second: ClipTexture) -> Matches:
 
 
 def sample_places(places: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """[S, S, 6] at positions [S, S, 2]; NaN where a neighbour is."""
+    """[S, S, 6] at positions [S, S, 2]; NaN where a neighbour is. places [H, W, 6] mm: places and normals; target
+    [S, S, 2] px."""
     return np.concatenate([sample(places[..., k : k + 3], target, outside=np.nan) for k in (0, 3)], axis=-1)
 
 
 def likeness(one: np.ndarray, two: np.ndarray, sigma: float) -> np.ndarray:
-    """[H, W]: correlation of two images [H, W] within Gaussian windows of that width."""
+    """[H, W]: correlation of two images, one [H, W] and two [H, W], within Gaussian windows of width sigma, px."""
 
     def mean(image: np.ndarray) -> np.ndarray:
         return cv2.GaussianBlur(image, (0, 0), sigma)

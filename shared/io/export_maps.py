@@ -76,7 +76,7 @@ class MapWriter:
         self._write(path, converted, self.colour_space, {"unit": unit, **extra}, latlong=latlong)
 
     def write_map(self, folder: Path, name: str, values: np.ndarray) -> None:
-        """A map named as in MAPS into folder."""
+        """A map named as in MAPS, values [H, W] or [H, W, 3], into folder."""
         kind, unit = MAPS[name]
         is_colour = kind == "colour"
         converted = acescg_from_rec709(values) if is_colour and self.acescg else values
@@ -97,7 +97,8 @@ class MapWriter:
 
 
 def integer_codes(name: str, values: np.ndarray, bits: int) -> np.ndarray:
-    """A map as 8- or 16-bit codes: colours sRGB-coded, data linear, both clipped to [0, 1]."""
+    """A map as 8- or 16-bit codes: colours sRGB-coded, data linear, both clipped to [0, 1]. values [H, W] or [H, W,
+    3]."""
     coded = encode_srgb(values) if MAPS[name][0] == "colour" else np.clip(values, 0.0, 1.0)
     return (coded * (2**bits - 1) + 0.5).astype(np.uint8 if bits == 8 else np.uint16)
 
@@ -127,7 +128,7 @@ def paste_crop(crop: np.ndarray, placement: tuple[float, float, float], size: tu
 
 
 def map_errors(name: str, values: np.ndarray) -> list[str]:
-    """Sentences about a map's shape and range."""
+    """Sentences about a map's shape and range. values [H, W] or [H, W, 3]."""
     height, width = values.shape[:2]
     errors = []
     if height != width or width & (width - 1):

@@ -37,12 +37,12 @@ def write_exr(
     latlong: bool = False,
     layout: str = "scanline",
 ) -> None:
-    """Writes [H, W] (channel Y) or [H, W, 3] (RGB) as a ZIP-compressed EXR.
+    """Writes array [H, W] (channel Y) or [H, W, 3] (RGB) as a ZIP-compressed EXR.
 
     colour_space: one of COLOUR_SPACES ("data": no colour). half: 16-bit floats, clamped to +-65504. attributes are
-    stored as "limn:<name>". latlong marks an environment map. layout: one of LAYOUTS; mipmap halves the picture down
-    to one pixel by box filter, in tiles. Errors: LimnError for a wrong shape, for values that are not finite, or when
-    the file does not read back as written.
+    stored as "limn:<name>". latlong marks an environment map. layout: one of LAYOUTS; mipmap halves the picture down to
+    one pixel by box filter, in tiles. Errors: LimnError for a wrong shape, for values that are not finite, or when the
+    file does not read back as written.
     """
     array = np.asarray(array)
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:
@@ -146,7 +146,7 @@ def exr_size(path: Path | str) -> tuple[int, int]:
 
 
 def write_png(path: Path | str, array: np.ndarray) -> None:
-    """Writes [H, W] or [H, W, 3] RGB, uint8 or uint16, losslessly."""
+    """Writes array [H, W] or [H, W, 3] RGB, uint8 or uint16, losslessly."""
     ordered = cv2.cvtColor(array, cv2.COLOR_RGB2BGR) if array.ndim == 3 else array
     done, data = cv2.imencode(".png", ordered, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:

@@ -100,8 +100,8 @@ def world_from_head_rigid(capture: UsdCapture) -> np.ndarray:
 def animate(prim: UsdGeom.Xformable, world_from_local: np.ndarray, time_codes: np.ndarray) -> None:
     """Time samples [F, 4, 4] of a rigid motion as translate and orient.
 
-    Quaternions, unlike matrices, stay rotations when a reader interpolates between samples. Neighbours are
-    kept in one hemisphere so that it takes the short way.
+    Quaternions, unlike matrices, stay rotations when a reader interpolates between samples. Neighbours are kept in one
+    hemisphere so that it takes the short way. world_from_local [F, 4, 4] mm; time_codes [F]: numbers of frames.
     """
     translate = prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
     orient = prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)

@@ -4,7 +4,7 @@ A .usdz is a zip whose members are stored uncompressed with their data aligned t
 USD's own packager stamps the files' modification times into it; this one stamps a constant. What viewers for
 consumers ask beyond the format is kept too: one binary root layer that composes nothing from outside, y up, and
 8-bit PNG textures for what UsdPreviewSurface reads; only what PNG cannot hold (indices of refraction, specular
-weights beyond 1, the light) stays EXR, and a viewer that cannot read it falls back to skin's usual gloss.
+weights beyond 1, the light) stays EXR, and a viewer that cannot read it falls back to skin's usual roughness.
 
 Reference: Usdz file format specification 1.3.
 """

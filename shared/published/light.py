@@ -70,7 +70,8 @@ class CubeSampler:
         return (light[index] * weight[..., None]).sum(1)
 
     def fixed(self, light: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-        """The same, for very many directions that carry no gradient of their own."""
+        """The same, for very many directions that carry no gradient of their own. light [6 n^2, C]; directions [M,
+        3]."""
         with torch.no_grad():
             index, weight = self.taps(directions)
         return _FixedLookup.apply(light, index, weight)
@@ -119,6 +120,7 @@ class SparseOperator:
         self._matrix, self._transposed = (_torch_csr(m.tocsr(), dtype) for m in (matrix, matrix.T))
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
+        """The matrix [M, N] times x [N, C] -> [M, C]."""
         return _Product.apply(x, self._matrix, self._transposed)
 
 
@@ -202,7 +204,8 @@ class PrefilteredLight:
 
 
 class LightSampling:
-    """Directions in proportion to the light's brightness, uniform within a texel, and the density of any direction."""
+    """Directions in proportion to the light's brightness, uniform within a texel, and the density of any direction.
+    light [6 n^2, 3]."""
 
     def __init__(self, light: torch.Tensor):
         self.resolution = round((len(light) / 6) ** 0.5)
@@ -247,7 +250,8 @@ def energy_table() -> np.ndarray:
 
 
 def split_sum_energy(cosine: torch.Tensor, roughness: torch.Tensor, f0: float) -> torch.Tensor:
-    """F0 A + B [P], bilinear in the table, differentiable by both arguments [P]."""
+    """F0 A + B [P], bilinear in the table, differentiable by both arguments [P]. cosine [P] of the angle to the
+    normal; roughness [P]."""
     table = torch.from_numpy(energy_table()).to(cosine.dtype)[None]
     place = torch.stack([2.0 * cosine.clamp(MINIMUM_COSINE, 1.0) - 1.0, 2.0 * roughness - 1.0], dim=-1)[None, None]
     scale, bias = torch.nn.functional.grid_sample(table, place, padding_mode="border", align_corners=False)[0, :, 0]

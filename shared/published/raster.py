@@ -49,7 +49,7 @@ class Pairs:
         return len(self.near)
 
     def take(self, chosen: np.ndarray) -> Pairs:
-        """Some of the pairs."""
+        """Some of the pairs. chosen [n] int or bool."""
         return Pairs(self.near[chosen], self.far[chosen], self.edge[chosen], self.axis[chosen], self.sign[chosen])
 
 
@@ -109,7 +109,8 @@ class Raster:
         pixels: np.ndarray,
         face: np.ndarray,
     ) -> SurfacePoints:
-        """The surface behind flat pixel indices [P] that see these faces [P]; normals [V, 3] of the vertices."""
+        """The surface behind flat pixel indices [P] that see these faces [P]; normals [V, 3] of the vertices. pixels
+        [P] int; face [P] int."""
         origin = self._tensor(camera_centres(camera_from_head))
         direction = self._tensor(self._rays[pixels] @ camera_from_head[:3, :3])
         index = torch.from_numpy(face.astype(np.int64))

@@ -99,7 +99,7 @@ class ReferenceSolver:
         return self.steps.vertices(self.parameters["vertices"])
 
     def texture(self, uv: torch.Tensor) -> TorchMaterial:
-        """The maps at [P, 2] texture coordinates, bilinear."""
+        """The maps at texture coordinates uv [P, 2], bilinear."""
         maps = self.parameters
         stacked = torch.cat([maps["albedo"], maps["specular"][..., None], maps["roughness"][..., None]], dim=-1)
         place = torch.stack([2.0 * uv[:, 0] - 1.0, 1.0 - 2.0 * uv[:, 1]], dim=-1)[None, None]

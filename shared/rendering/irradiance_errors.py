@@ -63,8 +63,8 @@ def places_around(points: Points, reach_mm: float) -> np.ndarray:
 def shadow_uncertainty(
     points: Points, transfer: Transfer, light: np.ndarray, directions: np.ndarray, reach_mm: float
 ) -> np.ndarray:
-    """[P, N] standard deviation of the irradiance over pi of P points in lights [J, N] along directions [J, 3], given
-    that the borders of shadows are known to reach_mm."""
+    """[P, N] standard deviation of the irradiance over pi of P points in lights [J, N] along directions [J, 3],
+    given that the borders of shadows are known to reach_mm. light [J, N] linear."""
     near, normals = places_around(points, reach_mm), points.normals.astype(np.float32)
     squared = np.zeros((len(points), light.shape[1]), np.float32)
     for start in range(0, light.shape[1], _LIGHTS_AT_ONCE):

@@ -38,7 +38,7 @@ class SpecularTransfer:
         self._split_sum: SplitSum | None = None
 
     def take(self, index: np.ndarray) -> SpecularTransfer:
-        """The table of the points at index."""
+        """The table of the points index [n] int."""
         part = copy(self)
         part.normals, part.visible = self.normals[index], self.visible[index]
         return part
@@ -57,7 +57,7 @@ class SpecularTransfer:
         return np.ndim(roughness) > 0 or roughness >= self.narrowest
 
     def split_sum(self, part: slice, towards: np.ndarray, roughness: float) -> tuple[np.ndarray, np.ndarray]:
-        """Weights of narrow lobes: all directions [p, J], and the open share [p, J]."""
+        """Weights of narrow lobes: all directions [p, J], and the open share [p, J]. towards [p, 3] unit."""
         if self._split_sum is None:
             self._split_sum = SplitSum(self.directions.T.astype(np.float64))
         return self._split_sum.kernel(self.normals[part], towards, float(roughness), self.visible[part])

@@ -77,7 +77,7 @@ def _add_radiance(face, bary, faces, face_uvs, uvs, albedo, specular_intensity, 
         fx, fy = x - np.float32(left), y - np.float32(top)
         right, bottom, left, top = (left + 1) % size, (top + 1) % size, left % size, top % size
         corners = (one - fx) * (one - fy), fx * (one - fy), (one - fx) * fy, fx * fy
-        gloss = (corners[0] * specular_intensity[top, left] + corners[1] * specular_intensity[top, right]
+        specular = (corners[0] * specular_intensity[top, left] + corners[1] * specular_intensity[top, right]
                  + corners[2] * specular_intensity[bottom, left] + corners[3] * specular_intensity[bottom, right])
         for c in range(3):
             diffuse = (corners[0] * albedo[top, left, c] + corners[1] * albedo[top, right, c]
@@ -86,4 +86,4 @@ def _add_radiance(face, bary, faces, face_uvs, uvs, albedo, specular_intensity, 
             for k in range(3):
                 irradiance += bary[n, k] * shade[faces[face[n], k], c]
                 reflection += bary[n, k] * shade[faces[face[n], k], c + 3]
-            radiance[n, c] += diffuse * irradiance + gloss * reflection
+            radiance[n, c] += diffuse * irradiance + specular * reflection

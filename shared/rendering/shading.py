@@ -157,11 +157,11 @@ class VertexShading:
         return value[self.stand_in]
 
     def irradiance_of_points(self, rows: np.ndarray) -> np.ndarray:
-        """E [n, F, 3] float32 of some of the P points, each its own, in all frames."""
+        """E [n, F, 3] float32 of some of the P points, rows [n] int, each its own, in all frames."""
         return self._irradiance[rows].astype(np.float32)
 
     def roughness_of(self, rows: np.ndarray) -> float | np.ndarray:
-        """Of some of the P points: [n] where it varies."""
+        """Of some of the P points, rows [n] int: [n] where it varies."""
         local = self.material.local_roughness
         return self.material.roughness if local is None else np.maximum(local[rows], self.table.narrowest)
 
@@ -192,13 +192,13 @@ class VertexShading:
 
 def _stand_ins(vertices: np.ndarray, index: np.ndarray, blocked: np.ndarray, deep: float) -> np.ndarray:
     """[V]: for each vertex the place in index of the nearest shaded vertex in the open, its own where it is one."""
-    trusted = np.nonzero(blocked < deep)[0]
-    if len(trusted) == 0:
-        trusted = np.arange(len(index))
+    open_points = np.nonzero(blocked < deep)[0]
+    if len(open_points) == 0:
+        open_points = np.arange(len(index))
     result = np.full(len(vertices), -1)
-    result[index[trusted]] = trusted
+    result[index[open_points]] = open_points
     others = np.nonzero(result < 0)[0]
-    result[others] = trusted[cKDTree(vertices[index[trusted]]).query(vertices[others])[1]]
+    result[others] = open_points[cKDTree(vertices[index[open_points]]).query(vertices[others])[1]]
     return result
 
 
@@ -222,8 +222,8 @@ def key_frames(turn: np.ndarray, step: float) -> np.ndarray:
 def light_along(
     light: np.ndarray, directions: np.ndarray, world_from_head: np.ndarray, light_index: np.ndarray | None = None
 ) -> np.ndarray:
-    """Cubemap [6 n^2, C] along head-space directions [J, 3] in F frames -> [J, F, C] float32; light_index [F]: which of
-    several, one below the other."""
+    """Cubemap [6 n^2, C] along head-space directions [J, 3] in F frames -> [J, F, C] float32; light_index [F]: which
+    of several, one below the other. light [6 n^2, C] linear; world_from_head [F, 3, 3]."""
     lights = 1 if light_index is None else int(light_index.max()) + 1
     resolution = round((len(light) / 6 / lights) ** 0.5)
     lookup = frame_lookup(directions, world_from_head, resolution, light_index)

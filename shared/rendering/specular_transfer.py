@@ -38,7 +38,8 @@ def specular_tables(
 
 
 def specular_slopes(table: SpecularTransfer, towards: np.ndarray, roughness: float) -> tuple[torch.Tensor, np.ndarray]:
-    """Derivatives of specular_tables by the logarithm of the roughness, as central differences; shapes as there."""
+    """Derivatives of specular_tables by the logarithm of the roughness, as central differences; shapes as there.
+    towards [P, F, 3] unit."""
     ends = [roughness * float(np.exp(side * _LOG_STEP)) for side in (-1.0, 1.0)]
 
     def tabulate(view: np.ndarray, bits: np.ndarray, blocked: np.ndarray) -> None:

@@ -55,7 +55,8 @@ def studio_light(name: str) -> np.ndarray:
 
 
 def facing_irradiance(radiance: np.ndarray) -> float:
-    """Irradiance over pi, mean of the channels, on the sides of a head: the mean over facets facing yaw -50, 0, 50."""
+    """Irradiance over pi, mean of the channels, on the sides of a head: the mean over facets facing yaw -50, 0, 50.
+    radiance [H, W, 3] linear, lat-long."""
     height = len(radiance)
     directions = latlong_directions(height)
     solid = np.sin(np.pi * (np.arange(height) + 0.5) / height)[:, None] * (np.pi / height) ** 2

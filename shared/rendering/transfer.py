@@ -41,7 +41,7 @@ class Points:
         return len(self.positions)
 
     def take(self, index: np.ndarray) -> Points:
-        """The points at index."""
+        """The points index [n] int."""
         return Points(self.positions[index], self.normals[index])
 
 
@@ -80,17 +80,17 @@ def mesh_points(mesh: Mesh, index: np.ndarray | slice = slice(None)) -> Points:
 def spread_vertices(vertices: np.ndarray, count: int, allowed: np.ndarray | None = None) -> np.ndarray:
     """Indices of at most count vertices, spread evenly over the area: one per occupied cell of a voxel grid.
 
-    vertices [V, 3]; allowed [V] bool or None. The cells are the smallest of a ladder of sizes that no more than count
-    of are occupied; within a cell the vertex nearest to the cell's mean wins. Of equally near ones, as two in a cell
-    always are, one is drawn by its number (Knuth's multiplicative hash): the first would be one that a subdivision
-    started from, and never one that it added. Sizes found by bisection would end where a vertex crosses from one cell
-    to the next, so that a vertex that moved by a rounding would change all the others.
+    vertices [V, 3] mm; allowed [V] bool or None. The cells have the smallest of a fixed series of sizes of which no
+    more than count are occupied; within a cell the vertex nearest to the cell's mean wins. Of equally near ones, as
+    two in a cell always are, one is drawn by its number (Knuth's multiplicative hash): the first would be one that a
+    subdivision started from, and never one that it added. Sizes found by bisection would end where a vertex crosses
+    from one cell to the next, so that a vertex that moved by a rounding would change all the others.
     """
     candidates = np.arange(len(vertices)) if allowed is None else np.nonzero(allowed)[0]
     if len(candidates) <= count:
         return candidates
     points = vertices[candidates]
-    low, high = 0, 1  # rungs of the ladder: too many cells, few enough
+    low, high = 0, 1  # numbers of sizes: too many cells, few enough
     while len(np.unique(_cells(points, _cell_size(high)))) > count:
         low, high = high, 2 * high
     while high - low > 1:
@@ -108,9 +108,9 @@ def spread_vertices(vertices: np.ndarray, count: int, allowed: np.ndarray | None
     return np.sort(candidates[order[first]])
 
 
-def _cell_size(rung: int) -> float:
+def _cell_size(number: int) -> float:
     """Edge of a cell in mm, from 1 um on in steps of 0.5 %."""
-    return 1e-3 * 1.005**rung
+    return 1e-3 * 1.005**number
 
 
 def _cells(points: np.ndarray, size: float) -> np.ndarray:

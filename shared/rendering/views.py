@@ -171,10 +171,10 @@ class HeadViews:
         uv[mesh.faces.ravel()] = mesh.uvs[mesh.face_uvs.ravel()]
         nearest = cKDTree(mesh.vertices).query(self.precomputed.nodes.points.positions)[1]
         albedo = sample_bilinear(maps["diffuse_albedo"], uv[nearest])
-        gloss = float(np.median(sample_bilinear(maps["specular_intensity"], uv)))
+        specular = float(np.median(sample_bilinear(maps["specular_intensity"], uv)))
         roughness = sample_bilinear(maps["roughness"], uv).ravel()
         varies = np.ptp(roughness) > 1e-3
-        return Material(albedo, gloss, float(np.median(roughness)), roughness[self.index] if varies else None)
+        return Material(albedo, specular, float(np.median(roughness)), roughness[self.index] if varies else None)
 
     def render(
         self, light: np.ndarray, cameras: Sequence[ViewCamera], moves: str = "camera", fade: bool = True
@@ -243,6 +243,7 @@ class HeadViews:
 
 
 def clip_light(envmap: np.ndarray, camera_from_head: np.ndarray, moves: str) -> np.ndarray:
-    """The recovered light as the head saw it when it looked into the camera: lat-long in head space."""
+    """The recovered light as the head saw it when it looked into the camera: lat-long in head space. envmap [H, W,
+    3] linear."""
     turned = world_from_head(camera_from_head[None, frontal_frame(camera_from_head)], moves)[0]
     return light_in_head_space(envmap, turned)

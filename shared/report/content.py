@@ -19,7 +19,7 @@ from shared.io.frames import FrameSet
 from shared.io.images import read_exr, read_png
 from shared.rendering.view_set import ViewSet
 
-SELECTION_SECONDS = "ladder_seconds.json"
+SELECTION_SECONDS = "model_selection_seconds.json"
 RESULT_FILES = {"sample_frames": "frames.json", "track_landmarks": "tracking.json", "inverse_render": "solve.json"}
 FRAMES_OF_OTHER_CLIPS = 3
 
@@ -166,7 +166,7 @@ def result_content(result: ReportInputs, frame_count: int) -> ReportContent:
         chart=read_png(chart) if chart.is_file() else None,
         excluded=excluded,
         model={**solve.get("model", {}), "albedo_scale": solve.get("albedo_scale")},
-        selection=record.get("ladder", ()),
+        selection=record.get("model_selection", ()),
         residuals=solve.get("residuals", {}),
         iterations=solve.get("iterations", []),
         costs=[_cost(name, values) for name, values in record["stages"].items()],
@@ -250,7 +250,7 @@ def stage_record(manifest: Mapping, provenance: Mapping) -> dict:
 def selection_record(folder: Path, solve: Mapping) -> list[dict]:
     """The candidates of inverse_render's model selection with the seconds that each took; empty where there was
     none."""
-    candidates, seconds = solve.get("ladder", ()), folder / SELECTION_SECONDS
+    candidates, seconds = solve.get("model_selection", ()), folder / SELECTION_SECONDS
     took = read_json(seconds) if seconds.is_file() else [None] * len(candidates)
     return [{**candidate, "seconds": value} for candidate, value in zip(candidates, took, strict=True)]
 

@@ -204,7 +204,7 @@ def error_rows(residuals: Mapping[str, object], frames: Sequence[Mapping]) -> li
     rows = []
     pair = [residuals.get(name) for name in ("fitted", "held_out")]
     if any(isinstance(value, (int, float)) for value in pair):
-        rows.append(("light and gloss, at sample points (share of full scale)", *map(number, pair)))
+        rows.append(("light and specular, at sample points (share of full scale)", *map(number, pair)))
     known = [frame for frame in frames if frame["psnr"] is not None]
     kinds = [[frame["psnr"] for frame in known if frame["held_out"] == held] for held in (False, True)]
     shown = [f"{np.mean(values):.1f}" if values else "-" for values in kinds]
@@ -234,7 +234,7 @@ def course_chart(iterations: Sequence[Mapping[str, float]]) -> str:
 
 def selection_rows(selection: Sequence[Mapping]) -> list[list[str]]:
     """The models that were tried, candidate by candidate."""
-    keys = ("part", "rung", "held_out", "fall", "standard_error", "climbed", "seconds")
+    keys = ("part", "candidate", "held_out", "fall", "standard_error", "accepted", "seconds")
     errors = ("held_out", "fall", "standard_error")
     return [[f"{row[key]:.6f}" if key in errors and row[key] is not None else number(row[key]).replace("_", " ")
              for key in keys] for row in selection]
@@ -243,7 +243,7 @@ def selection_rows(selection: Sequence[Mapping]) -> list[list[str]]:
 def solved_models(
     iterations: Sequence[Mapping], residuals: Mapping[str, object], model: Mapping[str, object]
 ) -> list[dict]:
-    """Models from what the solver logged: one per light model and resolution, one per width of the gloss.
+    """Models from what the solver logged: one per light model and resolution, one per width of the specular map.
 
     Errors are those of the last step of each; chosen: where model names it.
     """
@@ -259,7 +259,7 @@ def solved_models(
     tried = residuals.get("texture_held_out")
     for name, error in (tried.items() if isinstance(tried, Mapping) else ()):
         chosen = name == model.get("specular_variation")
-        candidates.append({"model": f"gloss over the map, {name}", "steps": None, "fitted": None, "held_out": error,
+        candidates.append({"model": f"specular map, {name}", "steps": None, "fitted": None, "held_out": error,
                            "chosen": chosen})
     return candidates
 

@@ -26,7 +26,8 @@ def grey_bytes(values: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def viridis_bytes(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    """[H, W] -> [H, W, 3] uint8 RGB in the viridis colour map (even in lightness, safe for colour blindness)."""
+    """[H, W] -> [H, W, 3] uint8 RGB in the viridis colour map (even in lightness, safe for colour blindness). low,
+    high: the values at its ends."""
     coloured = cv2.applyColorMap(grey_bytes(values, low, high), cv2.COLORMAP_VIRIDIS)
     return np.ascontiguousarray(coloured[..., ::-1])
 

@@ -27,7 +27,7 @@ REFERENCES = {
         "2014.",
     "Duff2017":
         "Duff et al., Building an Orthonormal Basis, Revisited. Journal of Computer Graphics Techniques 6, 2017.",
-    "Dupuy2023": "Dupuy, Benyoub, Sampling Visible GGX Normals with Spherical Caps. High-Performance Graphics 2023.",
+    "Dupuy2023": "Dupuy, Benyoub, Sampling Visible GGX Normals with Spherical Caps. Computer Graphics Forum 42, 2023.",
     "Geman1985":
         "Geman, McClure, Bayesian Image Analysis: An Application to Single Photon Emission Tomography. American "
         "Statistical Association, 1985.",

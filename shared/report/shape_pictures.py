@@ -56,7 +56,8 @@ def shape_sheet(start: Mesh, mesh: Mesh, face: np.ndarray | None, size: int = 40
 
 
 def shaded_picture(mesh: Mesh, yaw: float, centre: np.ndarray, extent: float, size: int) -> np.ndarray:
-    """uint8 [size, size, 3]: the mesh in grey under the pictures' lamp; camera as turned_camera has it."""
+    """uint8 [size, size, 3]: the mesh in grey under the pictures' lamp; camera as turned_camera has it. centre [3]
+    mm. yaw: as there; extent: of the picture, mm."""
     return _shaded(_Shape.of(mesh), *turned_camera(yaw, centre, extent, size), size)
 
 

@@ -108,13 +108,15 @@ class Trial:
 
 
 def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
-    """By how much the errors [H] of the same frames fell in the mean, and the standard error of that."""
+    """By how much the errors of the same frames, before [H] and after [H], fell in the mean, and the standard error
+    of that."""
     falls = before - after
     return float(falls.mean()), float(falls.std(ddof=1) / np.sqrt(len(falls)))
 
 
 def serves(before: np.ndarray, after: np.ndarray, worthwhile: float = WORTHWHILE) -> bool:
-    """Whether errors [H] fell by more than chance, and by more than a share of them."""
+    """Whether errors, before [H] and after [H], fell by more than chance, and by more than a share of them.
+    worthwhile: that share."""
     fall, standard_error = gain(before, after)
     return fall > max(standard_error, worthwhile * float(before.mean()))
 
@@ -162,8 +164,8 @@ class ModelSelection:
             return False
         self.tried.add(model)
         trial = self._try(model, None)
-        glossier = model.specular != self.present.model.specular
-        better = serves(self.present.errors, trial.errors, WORTHWHILE_SPECULAR if glossier else WORTHWHILE)
+        more_specular = model.specular != self.present.model.specular
+        better = serves(self.present.errors, trial.errors, WORTHWHILE_SPECULAR if more_specular else WORTHWHILE)
         self.report(describe("leap", ", ".join(model), trial, self.present, better))
         if better:
             self.present = trial
@@ -245,10 +247,10 @@ def describe(part: str, candidate: str, trial: Trial, below: Trial | None = None
     fall, standard_error = (None, None) if below is None else gain(below.errors, trial.errors)
     return {
         "part": part,
-        "rung": candidate,
+        "candidate": candidate,
         "held_out": float(trial.errors.mean()),
         "fall": fall,
         "standard_error": standard_error,
-        "climbed": selected,
+        "accepted": selected,
         "seconds": round(trial.seconds, 3),
     }

@@ -142,7 +142,7 @@ class ShapeSolver:
 
     def trace(self, mesh: Mesh, shaped: np.ndarray, before: Traced | None = None) -> Traced:
         """Looks at the shaped faces' vertices that some frame faces. before: of a coarser level, whose nearest point
-        tells what each sees."""
+        tells what each sees. shaped [F] bool: the faces that may move."""
         views, viewer = self.views, SurfaceViewer.of(mesh)
         wanted = np.zeros(len(mesh.vertices), bool)
         wanted[mesh.faces[shaped]] = True
@@ -162,7 +162,8 @@ class ShapeSolver:
         return replace(traced, reflections=Reflections(shading, np.arange(len(index))))
 
     def examine(self, mesh: Mesh, shaped: np.ndarray, traced: Traced) -> ShapedSurface | None:
-        """Samples, shading and equations of the traced vertices; None where hardly any is seen."""
+        """Samples, shading and equations of the traced vertices; None where hardly any is seen. shaped [F] bool: the
+        faces that may move."""
         views, settings, index = self.views, self.settings, traced.index
         points = mesh_points(mesh, index)
         samples = sample_surface(points.positions, traced.looks, views.camera_from_head, views.intrinsics)
@@ -208,7 +209,8 @@ class ShapeSolver:
         )
 
     def step(self, surface: ShapedSurface, start: np.ndarray, shaped: np.ndarray, held: np.ndarray) -> np.ndarray:
-        """Offsets [V] along the normals."""
+        """Offsets [V] along the normals. start [V, 3] mm: vertices of the level's first mesh; shaped [F] bool: the
+        faces that may move; held [F] bool: those that may not."""
         mesh, count = surface.mesh, len(surface.mesh.vertices)
         normals = vertex_normals(mesh.vertices, mesh.faces)
         turns = normal_turns(mesh.vertices, mesh.faces, normals, surface.index, surface.tangents)

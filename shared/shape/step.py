@@ -148,7 +148,8 @@ def point_terms(
     gradient: np.ndarray,
     count: int,
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """The points' equations (hessian [P, 3, 3], gradient [P, 3]) as a Hessian [V, V] and gradient [V] of offsets."""
+    """The points' equations (hessian [P, 3, 3], gradient [P, 3]) as a Hessian [V, V] and gradient [V] of offsets.
+    index [P] int: the points' vertices."""
     chosen = sparse.csr_matrix((np.ones(len(index)), (np.arange(len(index)), index)), (len(index), count))
     rows = (chosen, *turns)
     total, slope = sparse.csr_matrix((count, count)), np.zeros(count)

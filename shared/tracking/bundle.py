@@ -223,7 +223,7 @@ class BundleProblem:
         return ReducedSystem(matrix, rhs, coupling, half_inverse, point_rhs)
 
     def step(self, state: BundleState, system: ReducedSystem, damping: float) -> BundleState:
-        """Solves the damped camera system, then each point for itself."""
+        """Solves the damped camera system, then each point for itself. damping: relative to the diagonal."""
         matrix = system.matrix + damping * np.diag(np.diag(system.matrix) + 1e-12)
         cameras = cho_solve(cho_factor(matrix, check_finite=False), system.rhs, check_finite=False)
         frames = len(state.poses)
@@ -235,7 +235,7 @@ class BundleProblem:
 
 
 def moved(poses: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """Poses [F, 4, 4] turned and shifted by [F, 6]: rotation vector in camera axes, translation."""
+    """Poses [F, 4, 4] turned and shifted by motion [F, 6]: rotation vector in camera axes, translation in mm."""
     result = poses.copy()
     result[:, :3, :3] = rotation_from_vector(motion[:, :3]) @ poses[:, :3, :3]
     result[:, :3, 3] += motion[:, 3:]
@@ -335,7 +335,7 @@ def resect(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses alone, the points held: F independent robust Gauss-Newton solutions -> poses, covariances [F, 6, 6].
 
-    A frame that shows fewer than six points keeps its start and has an infinite covariance.
+    A frame that shows fewer than six points keeps its start and has an infinite covariance. points [N, 3] mm.
     """
     problem = BundleProblem(tracks, points, intrinsics, loss_scale=loss_scale, least_views=1)
     poses = np.array(camera_from_points, np.float64)
@@ -366,7 +366,8 @@ def place_points(
     prior_mm: float,
     iterations: int = 8,
 ) -> BundleSolution:
-    """Points alone, the poses held: N independent robust Gauss-Newton solutions. Arguments as in `adjust`."""
+    """Points alone, the poses held: N independent robust Gauss-Newton solutions. Arguments as in `adjust`. points
+    [N, 3] mm."""
     problem = BundleProblem(tracks, points, intrinsics, loss_scale=loss_scale, prior_mm=prior_mm)
     state = BundleState(np.array(camera_from_points, np.float64), problem.anchor.copy())
     for _ in range(iterations):

@@ -164,7 +164,8 @@ def choose_references(camera_from_points: np.ndarray, count: int) -> list[int]:
 def flow_over_landmarks(
     clip: TrackedClip, start: BundleSolution, posed: np.ndarray, settings: FlowSettings, progress: Callable
 ) -> Adjusted:
-    """Dense flow over the landmarks' triangulation, from the frame that stands in the middle."""
+    """Dense flow over the landmarks' triangulation, from the frame that stands in the middle. posed [F] bool: frames
+    that have a pose."""
     index = np.nonzero(posed)[0]
     reference = int(index[choose_references(start.camera_from_points[posed], 1)[0]])
     grid = grid_from_landmarks(clip.landmarks_px[reference], reference, _scale(clip, settings))
@@ -240,7 +241,8 @@ def _scale(clip: TrackedClip, settings: FlowSettings) -> float:
 
 
 def solve_tracks(clip: TrackedClip, tracks: Tracks, points: np.ndarray, poses: np.ndarray, prior_mm: float) -> Adjusted:
-    """Bundle adjustment of the frames and tracks that have enough observations; the worst 15 % of tracks dropped."""
+    """Bundle adjustment of the frames and tracks that have enough observations; the worst 15 % of tracks dropped.
+    points [N, 3] mm."""
     tracks, points, reliable = enough_observations(tracks, points)
     solved = adjust_clip(clip, tracks.subset(reliable), poses[reliable], points, prior_mm)
     error = np.nanmedian(solved.error_px, axis=0)
@@ -266,7 +268,8 @@ def adjust_clip(
 
 
 def enough_observations(tracks: Tracks, points: np.ndarray) -> tuple[Tracks, np.ndarray, np.ndarray]:
-    """Tracks seen in an eighth of the frames and in four, and which frames show LEAST_TRACKS of them; or InputError."""
+    """Tracks seen in an eighth of the frames and in four, and which frames show LEAST_TRACKS of them; or InputError.
+    points [N, 3] mm."""
     long_enough = tracks.seen.sum(0) >= max(4, 0.12 * len(tracks.pixels))
     tracks, points = tracks.subset(points=long_enough), points[long_enough]
     reliable = tracks.seen.sum(1) >= LEAST_TRACKS

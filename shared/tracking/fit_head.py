@@ -215,7 +215,7 @@ def landmarks_on_points(
 
 
 def triangulate(points_px: np.ndarray, camera_from_points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Least-squares points [N, 3] from pixels [F, N, 2] and poses [F, 4, 4] (Hartley and Zisserman, 12.2)."""
+    """Least-squares points [N, 3] from pixels points_px [F, N, 2] and poses [F, 4, 4] (Hartley and Zisserman, 12.2)."""
     x = (points_px - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]]
     pose = camera_from_points[:, None, :3]
     rows = pose[:, :, :2] - x[..., None] * pose[:, :, 2:]

@@ -81,7 +81,8 @@ def _vertex(costs: np.ndarray, lowest: int) -> float:
 
 
 def farther(poses: np.ndarray, points: np.ndarray, gain: float) -> np.ndarray:
-    """Poses [F, 4, 4] with the cloud [N, 3] `gain` times as far away: as large as before under as long a lens."""
+    """Poses [F, 4, 4] with the cloud, points [N, 3] mm, `gain` times as far away: as large as before under as long a
+    lens."""
     moved = np.array(poses, np.float64)
     depth = poses[:, 2, :3] @ points.mean(0) + poses[:, 2, 3]
     moved[:, 2, 3] += (gain - 1.0) * depth

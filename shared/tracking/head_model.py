@@ -70,7 +70,7 @@ class HeadModel:
         return vertices
 
     def mesh(self, identity: np.ndarray | None = None, expression: np.ndarray | None = None) -> Mesh:
-        """The surface with its texture coordinates for the given codes."""
+        """The surface with its texture coordinates for codes identity [<=I], expression [<=E], as in shape."""
         return Mesh(self.shape(identity, expression), self.faces, self.uvs, self.face_uvs)
 
     def landmarks(self, vertices: np.ndarray) -> np.ndarray:
@@ -123,7 +123,7 @@ def child_location(face: np.ndarray, bary: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def parent_location(face: np.ndarray, bary: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The inverse of `child_location`: one level up."""
+    """The inverse of `child_location`: one level up. face [N] int; bary [N, 3]."""
     middles = np.array([[0.5, 0.5, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5]])  # ab, bc, ca
     corners = np.eye(3)
     slots = np.stack(

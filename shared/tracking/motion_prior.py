@@ -64,7 +64,7 @@ class MotionPrior:
 def motion_prior_of(poses: np.ndarray, time_s: np.ndarray) -> MotionPrior | None:
     """The prior that a solution's own accelerations suggest: their robust spread, noise included, so it does not drag.
 
-    None for fewer than LEAST_FRAMES frames: there is no spread to speak of.
+    None for fewer than LEAST_FRAMES frames: there is no spread to speak of. time_s [F].
     """
     if len(poses) < LEAST_FRAMES:
         return None

@@ -91,7 +91,8 @@ def noise_factor(
 
 
 def rotations_apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Rotation vectors [F, 3] (camera axes) between rotations [F, 3, 3], but for a common turn of the head."""
+    """Rotation vectors [F, 3] (camera axes) between rotations [F, 3, 3], but for a common turn of the head. first
+    [F, 3, 3], second [F, 3, 3]."""
     common = nearest_rotation(np.einsum("fji,fjk->ik", second, first))
     return vector_from_rotation(first @ np.swapaxes(second @ common, 1, 2))
 

@@ -153,7 +153,8 @@ def track_texture(
 def solve_texture(
     clip: TrackedClip, tracks: Tracks, points: np.ndarray, poses: np.ndarray, prior_mm: float
 ) -> Adjusted:
-    """Rigid adjustment; then the noise is set to what was left over: tracks and frames that fit badly weigh less."""
+    """Rigid adjustment; then the noise is set to what was left over: tracks and frames that fit badly weigh less.
+    points [N, 3] mm."""
     tracks, points, reliable = enough_observations(tracks, points)
     for _ in range(2):
         solved = adjust_clip(clip, tracks.subset(reliable), poses[reliable], points, prior_mm)

@@ -132,7 +132,7 @@ def _window_sums(gradient, difference, known, weight, sigma) -> _WindowSums:
     gx, gy = gradient
     wx, wy = weight * gx, weight * gy
     products = wx * gx, wx * gy, wy * gy, wx * difference, wy * difference, weight
-    # outliers don't pull, but a window full of them is not to be trusted: its variance counts them
+    # outliers don't pull, but a window full of them says little: its variance counts them
     return _WindowSums(*(mean(values) for values in products), mean(known), mean(known * difference * difference))
 
 

@@ -45,7 +45,8 @@ def rotation_deviation_deg(track: HeadTrack, fits: np.ndarray) -> np.ndarray:
 
 
 def mouth_ratio(track: HeadTrack, fits: np.ndarray, lips_head: np.ndarray) -> float:
-    """Spread of the tracks near the lips [L, 3] over that of all others; 1 where too few are near."""
+    """Spread of the tracks near the lips [L, 3] over that of all others; 1 where too few are near. fits [F] bool:
+    frames that fit; lips_head [L, 3] mm."""
     near = (np.abs(track.points_head[:, None] - lips_head[None]).max(-1).min(1)) < 12.0
     if near.sum() < 10 or (~near).sum() < 10:
         return 1.0
@@ -56,7 +57,8 @@ def mouth_ratio(track: HeadTrack, fits: np.ndarray, lips_head: np.ndarray) -> fl
 def warnings_of(
     track: HeadTrack, fits: np.ndarray, frame_count: int, focal_known: bool, lips_head: np.ndarray
 ) -> list[str]:
-    """Everything that a person should know before the poses are used."""
+    """Everything that a person should know before the poses are used. fits [F] bool: frames that fit; lips_head [L,
+    3] mm."""
     warnings = []
     turned = rotation_range_deg(track.camera_from_head[fits])
     if turned < SMALL_ROTATION_DEG:

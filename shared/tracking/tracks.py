@@ -71,7 +71,8 @@ class SurfaceGrid:
 
 
 def grid_from_landmarks(landmarks_px: np.ndarray, reference: int, scale: float) -> SurfaceGrid:
-    """The reference frame's landmarks [468, 2], triangulated, as a surface."""
+    """The reference frame's landmarks [468, 2], triangulated, as a surface. scale: pixels of the grid per pixel of
+    the picture."""
     triangles = Delaunay(landmarks_px)
     low, high = np.floor(landmarks_px.min(0)), np.ceil(landmarks_px.max(0))
     x, y = np.meshgrid(np.arange(low[0], high[0], 1 / scale), np.arange(low[1], high[1], 1 / scale))
@@ -101,7 +102,8 @@ def grid_from_mesh(
     reference: int,
     scale: float,
 ) -> SurfaceGrid:
-    """What the reference camera [4, 4] sees of the mesh within box (x0, y0, x1, y1 px); usable_face [F] bool."""
+    """What the reference camera [4, 4] sees of the mesh within box (x0, y0, x1, y1 px); usable_face [F] bool. box
+    [4] px. scale: pixels of the grid per pixel of the picture."""
     zoomed = np.array(intrinsics, np.float64)
     zoomed[:2] *= scale
     zoomed[:2, 2] -= np.asarray(box[:2]) * scale
@@ -114,7 +116,7 @@ def grid_from_mesh(
 def visible_vertices(
     scene: RayScene, vertices: np.ndarray, normals: np.ndarray, camera_from_head: np.ndarray, least_cosine: float
 ) -> np.ndarray:
-    """[V] bool: faces the camera [4, 4] by at least that cosine, and nothing of the scene stands between."""
+    """[V] bool: faces the camera [4, 4] by at least least_cosine, and nothing of the scene stands between."""
     towards = normalised(camera_centres(camera_from_head) - vertices)
     seen = (normals * towards).sum(1) > least_cosine
     index = np.nonzero(seen)[0]
@@ -209,6 +211,6 @@ def _lookup(field: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def points_on_grid(grid: SurfaceGrid, where: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """The surface's points [N, 3] at grid places [N, 2] (row, column)."""
+    """The surface's points [N, 3] at grid places, where [N, 2] (row, column)."""
     corners = grid.corners[where[:, 0], where[:, 1]]
     return interpolate(vertices, corners, np.arange(len(corners)), grid.bary[where[:, 0], where[:, 1]])

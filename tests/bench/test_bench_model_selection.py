@@ -7,7 +7,7 @@ from tools.bench.model_selection import CANDIDATES, compare
 
 
 def row(clip, candidate, mesh, error, seconds):
-    return {"clip": clip, "rung": candidate, "mesh": mesh, "held_out": 1.2 * error, "held_out_abs": error,
+    return {"clip": clip, "candidate": candidate, "mesh": mesh, "held_out": 1.2 * error, "held_out_abs": error,
             "cpu_s": seconds,
             "light": "cubemap 8", "chosen": ""}
 

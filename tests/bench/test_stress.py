@@ -213,7 +213,7 @@ def test_verdicts_stand_in_the_table_the_page_and_the_picture(toy, tmp_path):
     toy()
     with open(tmp_path / "stress.csv", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert [(r["dial"], r["severity"], r["verdict"]) for r in rows] == [
+    assert [(r["perturbation"], r["severity"], r["verdict"]) for r in rows] == [
         ("toy", "0", RIGHT), ("toy", "1", WARNED), ("toy", "2", SILENT), ("other", "0", RIGHT), ("other", "1", RIGHT)]
     assert rows[2]["wrong"] == "albedo normals" and rows[2]["albedo"] == ""
     page = (tmp_path / "stress.md").read_text()

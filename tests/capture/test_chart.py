@@ -46,7 +46,7 @@ def test_a_patch_that_is_hidden_loses_its_say():
     patches = np.maximum(reflectances(), 0) * WHITE
     patches[18] *= 0.3
     fit = fit_chart(patches, UNCLIPPED)
-    assert fit.trust[18] < 0.1 < 0.7 < np.median(fit.trust)
+    assert fit.weight[18] < 0.1 < 0.7 < np.median(fit.weight)
     np.testing.assert_allclose(fit.white, WHITE, rtol=0.02)
 
 

@@ -81,8 +81,9 @@ ELSEWHERE = {
     "test_track_quality": {"tracking.json: excluded[].frame_index", "tracking.json: excluded[].reason"},
     "test_chart": {"frames.json: chart[]."},
     "test_chart_scale": {"albedo_scale.chart"},
-    "test_joint_clips": {"solve.json: clips", "run.json: clips", "clips/*/poses.npz: ", "iterations[].light_trust"},
-    "test_model_selection": {"solve.json: ladder", "run.json: ladder", "ladder_seconds.json: []"},
+    "test_joint_clips": {"solve.json: clips", "run.json: clips", "clips/*/poses.npz: ", "iterations[].light_weights"},
+    "test_model_selection": {"solve.json: model_selection", "run.json: model_selection",
+                             "model_selection_seconds.json: []"},
     "test_published": {f"solve.json: iterations[].{name}" for name in (
         "iteration", "image", "mask", "laplacian", "white_light", "diffuse", "roughness_variation")},
     "test_fit_appearance": {"iterations[].undone"},

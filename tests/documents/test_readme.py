@@ -1,5 +1,6 @@
 """The README and docs/ say what the code says, and every link leads somewhere."""
 
+import ast
 import importlib.util
 import re
 import tomllib
@@ -84,6 +85,23 @@ def test_what_the_documents_name_is_there(path):
     assert set(re.findall(r"--preset ([a-z]+)", text)) <= set(pipeline.presets)
     files = re.findall(r"`((?:shared|stages|tools|tests|profiles|container|docs)/[\w/.]*)`", text)
     assert [name for name in files if not (README.parent / name).exists()] == []
+
+
+def defined_names(path):
+    """Functions, classes and their methods (Class.method) of a module."""
+    names = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            names |= {node.name} | {f"{node.name}.{own.name}" for own in node.body if isinstance(own, ast.FunctionDef)}
+    return names
+
+
+@pytest.mark.parametrize("path", [path for path in TEXTS if path.name != "CHANGELOG.md"], ids=lambda path: path.name)
+def test_functions_that_the_documents_name_are_there(path):
+    """`shared/room/module.py:function`, `shared/room/module.py:Class.method`."""
+    named = re.findall(r"`([\w/]+\.py):([\w.]+)`", path.read_text(encoding="utf-8"))
+    assert len(named) > 20 or path.name != "architecture.md"
+    assert [pair for pair in named if pair[1] not in defined_names(README.parent / pair[0])] == []
 
 
 def limn_commands():

@@ -5,7 +5,7 @@ from pathlib import Path
 TINY = Path(__file__).resolve().parents[1] / "tiny"
 SETTINGS = (
     "track_landmarks.start_frames=8", "track_landmarks.references=1", "track_landmarks.flow_tracks=100",
-    "track_landmarks.tracks=100", "track_landmarks.texel=2", "track_landmarks.warp_width=100", "init_albedo.size=64",
+    "track_landmarks.tracks=100", "track_landmarks.texel_px=2", "track_landmarks.warp_width=100", "init_albedo.size=64",
     "init_albedo.frames=4", "inverse_render.points=200", "inverse_render.directions=128",
     "inverse_render.bounce_nodes=50", "inverse_render.light_resolution=4", "inverse_render.light_frames=4",
     "inverse_render.light_steps=2", "inverse_render.map_size=64", "inverse_render.render_count=1",

@@ -90,12 +90,12 @@ def test_clipped_and_crushed_channels_are_marked():
                           flat_picture(64, 64, codes).saturation)
 
 
-def test_trust_fades_towards_the_mask():
+def test_weight_fades_towards_the_mask():
     mask = np.zeros((64, 64), np.uint8)
     mask[:, 20:] = 128
     picture = prepare_picture(np.full((64, 64, 3), 99, np.uint8), np.zeros((64, 64, 3), np.float32), mask)
-    trust = sample_inside(picture, np.array([[10.5, 30.5], [20.5, 30.5], [22.5, 30.5], [40.5, 30.5]]))
-    assert trust[0] == 0.0 and trust[1] < trust[2] < trust[3] == 1.0
+    weight = sample_inside(picture, np.array([[10.5, 30.5], [20.5, 30.5], [22.5, 30.5], [40.5, 30.5]]))
+    assert weight[0] == 0.0 and weight[1] < weight[2] < weight[3] == 1.0
 
 
 def test_the_camera_sees_the_front_of_a_ball():

@@ -148,7 +148,7 @@ def test_the_chart_of_the_first_clip_that_shows_one_counts():
 
 GAIN = np.array([0.55, 0.7, 0.9])
 SHARPER = tuple(word for setting in (
-    "track_landmarks.tracks=600", "track_landmarks.flow_tracks=300", "track_landmarks.texel=1",
+    "track_landmarks.tracks=600", "track_landmarks.flow_tracks=300", "track_landmarks.texel_px=1",
     "track_landmarks.warp_width=200", "init_albedo.size=256", "init_albedo.frames=12", "inverse_render.light_steps=6",
     "inverse_render.light_frames=12", "inverse_render.points=500", "export_usd.usdz=false", "export_usd.glb=false",
 ) for word in ("--set", setting))

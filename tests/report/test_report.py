@@ -92,7 +92,7 @@ def test_page_says_what_was_found(page):
     for words in ("frames used", "landmarks absent", "blurred", "the focal length is not given", "held out",
                   "cubemap 16", "1.5", "render minus clip", "head.usdz", "png_copies", "roughness 0.3", "low sun",
                   "50\u00b0 to the left", "Models tried", "The colour chart as found",
-                  "light, cubemap 16", "gloss over the map, one value"):
+                  "light, cubemap 16", "specular map, one value"):
         assert words in shown, words
 
 

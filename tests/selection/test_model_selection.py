@@ -23,7 +23,7 @@ from shared.appearance.fit import Solution
 from shared.appearance.problem import AppearanceSettings
 from shared.compute.run_context import SILENT, RunContext
 from shared.contract.job import Parameters
-from shared.contract.records import LADDER_TIMES, RUN, SOLVE
+from shared.contract.records import RUN, SELECTION_TIMES, SOLVE
 from shared.errors import InputError
 from shared.geometry.mesh import segments_at
 from shared.inverse import model_selection
@@ -64,7 +64,7 @@ def test_a_matte_evenly_lit_head_ends_low(matte):
     selection, records = matte
     assert selection.present.model.specular == "none"
     assert selection.present.model.light == "harmonics_2"
-    refused = {record["rung"] for record in records if not record["climbed"]}
+    refused = {record["candidate"] for record in records if not record["accepted"]}
     assert {"one_value", "sun_sky", "harmonics_4"} <= refused
     assert selection.present.errors.mean() < 1.5 * NOISE
 
@@ -83,9 +83,9 @@ def test_every_candidate_is_on_the_record_with_its_error_and_seconds(glossy):
     for record in records[1:]:
         assert record["fall"] == pytest.approx(held_out - record["held_out"], abs=1e-12)
         worthwhile = 0.0 if record["part"] == "visibility" else 0.005 * held_out
-        assert record["climbed"] == (record["fall"] > max(record["standard_error"], worthwhile))
+        assert record["accepted"] == (record["fall"] > max(record["standard_error"], worthwhile))
         assert record["seconds"] > 0.0
-        held_out = record["held_out"] if record["climbed"] else held_out
+        held_out = record["held_out"] if record["accepted"] else held_out
     assert held_out == pytest.approx(float(selection.present.errors.mean()))
     assert len(selection.tried) == len(records)  # no model twice
 
@@ -106,7 +106,7 @@ def test_gloss_that_differs_by_segment_is_found_and_worn(one_thread):
     forehead = (height > np.median(height)).astype(int)
     variation, records = variation_of(capture, forehead, specular=("one_value",))
     assert variation.roughness == "by_segment" and variation.specular == "one_value"
-    assert [record["rung"] for record in records] == ["by_segment", "local"]
+    assert [record["candidate"] for record in records] == ["by_segment", "local"]
     solution = Solution(under_true_light(capture)[1], (), 0.0, 0.0)
     worn = variation.worn_by(replace(solution, state=replace(solution.state, roughness=1.1 * ROUGHNESS)))
     found = worn.local_roughness_fit.roughness(capture.points.positions)
@@ -152,8 +152,8 @@ def test_where_shadows_do_not_serve_all_parts_are_tried_at_once(monkeypatch, alo
     leaps = [record for record in records if record["part"] == "leap"]
     assert len(leaps) == (not alone) and (alone or found.model == whole)
     if not alone:
-        assert leaps[0]["rung"] == "bounces, one_value, cubemap_8" and leaps[0]["climbed"]
-        assert records[-1]["rung"] == "cubemap_16"  # and the climb goes on from there
+        assert leaps[0]["candidate"] == "bounces, one_value, cubemap_8" and leaps[0]["accepted"]
+        assert records[-1]["candidate"] == "cubemap_16"  # and the climb goes on from there
 
 
 def tried_candidates(monkeypatch, error_of):
@@ -163,7 +163,7 @@ def tried_candidates(monkeypatch, error_of):
                         start: Trial(model, None, error_of(model) * frames, 0.1))
     monkeypatch.setattr(ModelSelection, "_at_bottom", lambda self: False)
     ModelSelection({}, CAREFUL, allowed_candidates(CAREFUL), records.append).select()
-    return [(record["rung"], record["climbed"]) for record in records if record["part"] in ("light", "specular")]
+    return [(record["candidate"], record["accepted"]) for record in records if record["part"] in ("light", "specular")]
 
 
 def test_harmonics_are_passed_over_once_a_sun_serves(monkeypatch):
@@ -266,8 +266,8 @@ def test_the_mesh_is_refined_as_far_as_it_serves(one_thread, monkeypatch):
     assert asked == [(0, None), (1, "level 0")]  # the second goes on where the first ended
     assert selected.shape_record["refined"] and selected.shape_record["stopped_vertices"] == 3
     assert selected.shape_record["held_out"]["after"] < 0.5 * selected.shape_record["held_out"]["before"]
-    meshes = [(candidate["rung"],
-               candidate["climbed"]) for candidate in selected.candidates if candidate["part"] == "geometry"]
+    meshes = [(candidate["candidate"],
+               candidate["accepted"]) for candidate in selected.candidates if candidate["part"] == "geometry"]
     assert meshes == [("refined", True), ("subdivided_1", False)]
     assert selected.settings.appearance.specular is False and selected.start.held_out > 0.0
 
@@ -310,11 +310,12 @@ def test_model_selection_reaches_run_json_and_the_report(glossy, tmp_path):
     _, records = glossy
     candidates = [dict(record) for record in records]
     seconds = [candidate.pop("seconds") for candidate in candidates]
-    (tmp_path / "ladder_seconds.json").write_text(json.dumps(seconds))
-    merged = selection_record(tmp_path, {"ladder": candidates})
-    assert field_faults(seconds, LADDER_TIMES) == []
-    assert [field_faults(candidate, below(SOLVE, "ladder[]")) for candidate in candidates] == [[]] * len(candidates)
-    assert [field_faults(candidate, below(RUN, "ladder[]")) for candidate in merged] == [[]] * len(candidates)
+    (tmp_path / "model_selection_seconds.json").write_text(json.dumps(seconds))
+    merged = selection_record(tmp_path, {"model_selection": candidates})
+    assert field_faults(seconds, SELECTION_TIMES) == []
+    for declared, written in ((SOLVE, candidates), (RUN, merged)):
+        fields = below(declared, "model_selection[]")
+        assert [field_faults(candidate, fields) for candidate in written] == [[]] * len(candidates)
     assert merged == [dict(record) for record in records]
     rows = selection_rows(merged)
     assert len(rows) == len(records) and any("harmonics 2" in cell for row in rows for cell in row)

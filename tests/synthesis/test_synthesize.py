@@ -22,7 +22,7 @@ from shared.tracking.models import load_face_networks
 from tools.synthesis.camera import PictureQuality, PinholeCamera, take_picture
 from tools.synthesis.chart import PlacedChart, add_chart, chart_irradiance
 from tools.synthesis.head import DRIFT_DEG, YAW_DEG, head_turn
-from tools.synthesis.highlights import GlossSamples, glossy_radiance, sample_lobe
+from tools.synthesis.highlights import LobeSamples, sample_lobe, specular_radiance
 from tools.synthesis.irradiance import IrradianceQuality, SyntheticShot, assemble_atlas, group_irradiance
 from tools.synthesis.light import ENVIRONMENTS, EnvironmentLight, procedural_environment
 from tools.synthesis.output import ClipWriter, rounded, sensor_codes
@@ -114,17 +114,17 @@ def test_lobe_samples_integrate_to_the_directional_albedo():
         assert weight.mean() == pytest.approx(float(brdf.directional_albedo(np.array([cosine]), 0.4)[0]), rel=0.01)
 
 
-def test_gloss_of_a_lit_globe_matches_a_numeric_integral():
+def test_specular_of_a_lit_globe_matches_a_numeric_integral():
     light = EnvironmentLight(procedural_environment("studio", 3))
     surface = SyntheticSurface(round_mesh(80.0, np.pi, inward=False), plain())
     directions, solid_angle = hemisphere_quadrature(96, 192)
     rng = np.random.default_rng(0)
-    samples = GlossSamples.draw(light, np.eye(3), 256, 256, rng)
+    samples = LobeSamples.draw(light, np.eye(3), 256, 256, rng)
     face = rng.integers(len(surface.mesh.faces), size=40)
     points = surface.points(face, np.full((40, 3), 1 / 3))
     outgoing = points.normal + 0.3 * rng.normal(size=(40, 3))
     outgoing = (outgoing / np.linalg.norm(outgoing, axis=1, keepdims=True)).astype(np.float32)
-    found = glossy_radiance(surface, light, np.zeros((8, 8, 3), np.float32), np.eye(3), points, outgoing,
+    found = specular_radiance(surface, light, np.zeros((8, 8, 3), np.float32), np.eye(3), points, outgoing,
                             np.full(40, 0.4, np.float32), samples, np.arange(40))
     expected = []
     for normal, towards in zip(points.normal, outgoing, strict=True):
@@ -153,9 +153,9 @@ def test_the_fast_renderer_agrees_with_brute_force():
     outgoing = np.array([0, 0, 950.0]) - points.position
     outgoing = (outgoing / np.linalg.norm(outgoing, axis=1, keepdims=True)).astype(np.float32)
     specular, roughness = np.full(150, 0.8, np.float32), np.full(150, 0.45, np.float32)
-    gloss = glossy_radiance(surface, light, irradiance, turn, points, outgoing, roughness,
-                            GlossSamples.draw(light, turn, 128, 128, rng), np.arange(150) % 64)
-    fast = np.array(ALBEDO) / np.pi * sample_bilinear(irradiance, points.uv) + 0.8 * gloss
+    specular = specular_radiance(surface, light, irradiance, turn, points, outgoing, roughness,
+                            LobeSamples.draw(light, turn, 128, 128, rng), np.arange(150) % 64)
+    fast = np.array(ALBEDO) / np.pi * sample_bilinear(irradiance, points.uv) + 0.8 * specular
     slow, error = reference_radiance(surface, light, turn, points, outgoing, specular, roughness, 1500, seed=4)
     assert np.abs(fast.mean(0) / slow.mean(0) - 1).max() < 0.01
     tolerance = 4 * error + 0.03 * slow.mean()

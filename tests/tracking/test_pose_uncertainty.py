@@ -1,4 +1,4 @@
-"""How far poses can be trusted: against synthetic tracks whose true poses are known."""
+"""The covariance of poses, against synthetic tracks whose true poses are known."""
 
 import numpy as np
 import pytest

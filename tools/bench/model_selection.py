@@ -48,7 +48,7 @@ CANDIDATES: dict[str, dict] = {
 }
 SMALLEST = {"map_size": 64, "normal_map": False, "local_roughness": False}
 """Model selection ends before the maps; they are as small as they can be."""
-COLUMNS = ("clip", "rung", "mesh", "held_out", "held_out_abs", "cpu_s", "light", "chosen")
+COLUMNS = ("clip", "candidate", "mesh", "held_out", "held_out_abs", "cpu_s", "light", "chosen")
 
 
 def compile_loops() -> None:
@@ -78,14 +78,14 @@ def measure(inputs: ClipInputs, candidate: str, refine: bool, given: dict) -> di
     result = solve_clip(inputs.views, inputs.surface, settings, context)
     solution = result.solution
     judged = ~some_views(inputs.views.with_fitted(result.fitted), settings, settings.light_frames).fitted
-    climbed = [row for row in result.record["rungs"] if row["climbed"]]
+    accepted = [row for row in result.record["model_selection"] if row["accepted"]]
     return {
         "mesh": "refined" if refine else "tracked",
         "held_out": solution.held_out,
         "held_out_abs": float(solution.frame_errors[judged].mean()),
         "cpu_s": marks["tracing the surface"],
         "light": describe_light(solution.state),
-        "chosen": " > ".join(f"{row['part']} {row['rung']}" for row in climbed),
+        "chosen": " > ".join(f"{row['part']} {row['candidate']}" for row in accepted),
     }
 
 
@@ -94,13 +94,13 @@ def compare(rows: Sequence[dict]) -> list[dict]:
     result = []
     for clip in dict.fromkeys(row["clip"] for row in rows):
         own = [row for row in rows if row["clip"] == clip]
-        autos, fixed = ([row for row in own if (row["rung"] == "auto") == is_auto] for is_auto in (True, False))
+        autos, fixed = ([row for row in own if (row["candidate"] == "auto") == is_auto] for is_auto in (True, False))
         if autos and fixed:
             best, auto = min(fixed, key=lambda row: row["held_out_abs"]), autos[-1]
             least_square = min(row["held_out"] for row in fixed)
             result.append({
                 "clip": clip,
-                "best_fixed": f"{best['rung']}, {best['mesh']}",
+                "best_fixed": f"{best['candidate']}, {best['mesh']}",
                 "auto": ", ".join(f"{key} {auto[key]}" for key in ("light", "chosen")),
                 "error_ratio": auto["held_out_abs"] / best["held_out_abs"],
                 "square_ratio": auto["held_out"] / least_square,
@@ -128,7 +128,8 @@ class ModelSelectionBench(SettingsBench):
         run, candidate, refine = case
         compile_loops()
         inputs = read_inputs(run / "work" / "sample_frames", run / "work" / "track_landmarks")
-        entry.add({"clip": run.resolve().name, "rung": candidate, **measure(inputs, candidate, refine, self.given)})
+        measured = measure(inputs, candidate, refine, self.given)
+        entry.add({"clip": run.resolve().name, "candidate": candidate, **measured})
 
     def conclude(self, table: Table) -> int:
         compared = compare(table.rows)

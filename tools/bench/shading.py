@@ -50,7 +50,7 @@ YAW_DEG, PITCH_DEG = -20.0, 8.0
 LIGHT_RESOLUTION, LATLONG_ROWS = 16, 512
 SIZES = Sizes(directions=768, nodes=1000)
 PUBLISHED_RESOLUTION, PUBLISHED_SAMPLES, SPLIT_SAMPLES = 64, 1024, 256
-GLOSS_SHARE = 8
+SPECULAR_SHARE = 8
 """The path tracer's paths with our lobe, which runs in Python, are so much fewer."""
 LARGEST_SHOWN = 60.0
 """Percent: where lobes slip between the directions, the sum over them says nothing."""
@@ -211,7 +211,7 @@ def measure(
     row("diffuse_all_bounces", stage.diffuse(SKIN, 2), stage.truth(Coat(SKIN), ALL_BOUNCES, samples))
     for roughness in roughnesses:
         coat = Coat((0.0, 0.0, 0.0), 1.0, roughness)
-        theirs = stage.truth(coat, DIRECT, max(2, samples // GLOSS_SHARE))
+        theirs = stage.truth(coat, DIRECT, max(2, samples // SPECULAR_SHARE))
         row("split_sum", stage.specular(roughness, True), theirs, roughness)
         row("direction_sum", stage.specular(roughness, False), theirs, roughness)
         row("published_split_sum", stage.published(coat, 1), theirs, roughness)

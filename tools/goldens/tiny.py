@@ -18,7 +18,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "directions=384",
         "bounce_nodes=300",
         "shape_subdivisions=0",
-        "shape_rounds=1",
+        "shape_steps=1",
         "render_count=2",
     ),
     "export_usd": ("view_size=128", "report_frames=2"),

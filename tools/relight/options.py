@@ -94,7 +94,8 @@ def parser(description: str) -> argparse.ArgumentParser:
         metavar="ROUGHNESS",
         help=f"pictures of V~ of the first view (default {' '.join(map(str, ROUGHNESSES))})",
     )
-    found.add_argument("--directions", type=int, default=1536, help="over the sphere (default 1536); 4096 for gloss")
+    found.add_argument("--directions", type=int, default=1536,
+                       help="over the sphere (default 1536); 4096 for narrow lobes")
     found.add_argument("--albedo", type=_numbers(3), metavar="R,G,B", help="of a mesh, linear (default .55,.55,.55)")
     found.add_argument("--specular", type=float, help="of a mesh: 1 (default) reflects 4 %% head-on")
     found.add_argument("--roughness", type=float, help="of a mesh, 0.05 to 1 (default 0.3)")

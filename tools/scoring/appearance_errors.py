@@ -39,11 +39,11 @@ def map_errors(
             truth = read_exr(f"{stem}_{name}.exr")[row[hit], column[hit]].reshape(hit.sum(), -1)
             pairs[name].append((truth[:, : found.shape[1]], found))
     joined = {name: tuple(np.concatenate(side) for side in zip(*both, strict=True)) for name, both in pairs.items()}
-    trusted = np.concatenate(confidence) > CONFIDENT
+    is_confident = np.concatenate(confidence) > CONFIDENT
     result = _albedo_errors(*joined["albedo"], np.concatenate(confidence))
-    result["confident_share"] = float(trusted.mean())
+    result["confident_share"] = float(is_confident.mean())
     for name in ("specular", "roughness"):
-        truth, found = (side[trusted, 0] for side in joined[name])
+        truth, found = (side[is_confident, 0] for side in joined[name])
         errors = measures.scalar_errors(truth, found)
         result |= {f"{name}_{key}": errors[key] for key in ("rmse", "correlation", "mean_gt", "mean_result")}
     return result

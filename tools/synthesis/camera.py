@@ -1,7 +1,7 @@
 """Pictures of the lit surface: radiance, and the buffers of the truth.
 
-Each pixel averages a regular grid of sub x sub primary rays. Diffuse light comes from the irradiance atlas, the glossy
-part from samples of its own.
+Each pixel averages a regular grid of sub x sub primary rays. Diffuse light comes from the irradiance atlas, the
+specular part from samples of its own.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from shared.geometry.mesh import normalised
 from shared.geometry.transforms import camera_centres, project
 from shared.imaging.texture import sample_bilinear
 from shared.rendering.envmap import latlong_lookup
-from tools.synthesis.highlights import SAMPLE_SETS, GlossSamples, glossy_radiance
+from tools.synthesis.highlights import SAMPLE_SETS, LobeSamples, specular_radiance
 from tools.synthesis.irradiance import SyntheticShot
 from tools.synthesis.light import EnvironmentLight
 from tools.synthesis.surface import SyntheticSurface
@@ -56,7 +56,7 @@ def take_picture(surface: SyntheticSurface, light: EnvironmentLight, irradiance:
     """
     rays = quality.sub**2
     rng = np.random.default_rng(shot.seed)
-    samples = GlossSamples.draw(light, shot.world_from_head, rays * quality.lobe_samples,
+    samples = LobeSamples.draw(light, shot.world_from_head, rays * quality.lobe_samples,
                                 rays * quality.lamp_samples, rng)
     pixels = _head_pixels(surface, shot, camera)
     choice = rng.integers(SAMPLE_SETS, size=len(pixels))
@@ -122,9 +122,9 @@ def _primary_hits(surface: SyntheticSurface, shot: SyntheticShot, camera: Pinhol
 
 def _shade(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray, shot: SyntheticShot,
            directions: np.ndarray,
-           values: dict, samples: GlossSamples, choice: np.ndarray) -> np.ndarray:
-    """[M, 3] radiance towards the camera: albedo / pi times irradiance, plus the glossy lobe."""
-    gloss = glossy_radiance(surface, light, irradiance, shot.world_from_head, values["points"],
-                            -normalised(directions), values["roughness"], samples, choice)
+           values: dict, samples: LobeSamples, choice: np.ndarray) -> np.ndarray:
+    """[M, 3] radiance towards the camera: albedo / pi times irradiance, plus the specular lobe."""
+    specular = specular_radiance(surface, light, irradiance, shot.world_from_head, values["points"],
+                                 -normalised(directions), values["roughness"], samples, choice)
     diffuse = values["albedo"] * sample_bilinear(irradiance, values["points"].uv) / np.float32(np.pi)
-    return diffuse + values["specular"][:, None] * gloss
+    return diffuse + values["specular"][:, None] * specular

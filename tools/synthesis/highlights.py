@@ -19,7 +19,7 @@ SAMPLE_SETS = 64
 
 
 @dataclass(frozen=True)
-class GlossSamples:
+class LobeSamples:
     """Random sets that points pick from: lobe [sets, K, 2] in the unit square; lamp directions in head space and
     weights [sets, K, 3]."""
 
@@ -29,25 +29,25 @@ class GlossSamples:
 
     @staticmethod
     def draw(light: EnvironmentLight, world_from_head: np.ndarray, lobe_count: int, lamp_count: int,
-             rng: np.random.Generator) -> GlossSamples:
+             rng: np.random.Generator) -> LobeSamples:
         """Well spread samples for one shot."""
         lobe = shifted_hammersley(lobe_count, SAMPLE_SETS, rng).astype(np.float32)
         lamps = shifted_hammersley(lamp_count, SAMPLE_SETS, rng)
         world, weights = light.sample_lamps(lamps.reshape(-1, 2))
         shape = (SAMPLE_SETS, lamp_count, 3)
         directions = (world @ world_from_head).reshape(shape).astype(np.float32)
-        return GlossSamples(lobe, directions, weights.reshape(shape).astype(np.float32))
+        return LobeSamples(lobe, directions, weights.reshape(shape).astype(np.float32))
 
-    def part(self, index: int, count: int) -> GlossSamples:
+    def part(self, index: int, count: int) -> LobeSamples:
         """Every count-th sample from `index` on: one stratum of each set."""
         every = slice(index, None, count)
-        return GlossSamples(self.lobe[:, every], self.lamp_directions[:, every], self.lamp_weights[:, every])
+        return LobeSamples(self.lobe[:, every], self.lamp_directions[:, every], self.lamp_weights[:, every])
 
 
-def glossy_radiance(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray,
-                    world_from_head: np.ndarray,
-                    points: ShadingPoints, outgoing: np.ndarray, roughness: np.ndarray, samples: GlossSamples,
-                    choice: np.ndarray) -> np.ndarray:
+def specular_radiance(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray,
+                      world_from_head: np.ndarray,
+                      points: ShadingPoints, outgoing: np.ndarray, roughness: np.ndarray, samples: LobeSamples,
+                      choice: np.ndarray) -> np.ndarray:
     """[N, 3] radiance that the lobe at specular_intensity 1 sends towards `outgoing` [N, 3].
 
     irradiance [size, size, 3] of the shot lights what the lobe sees of the head itself; choice [N]: set of each point.

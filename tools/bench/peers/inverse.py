@@ -39,7 +39,7 @@ from tools.bench.peers import mitsuba
 
 VARIANT = "llvm_ad_rgb"
 STAGES = ("sample_frames", "track_landmarks")
-MAP_SIZE, GLOSS_SIZE, LIGHT_HEIGHT = 512, 128, 32
+MAP_SIZE, SPECULAR_SIZE, LIGHT_HEIGHT = 512, 128, 32
 START_SPECULAR, START_ROUGHNESS = 0.7, 0.45
 """Where Limn starts from, too."""
 WHITE_SIGMA, CLIPPED = 0.15, 0.99
@@ -80,10 +80,10 @@ class PeerSolver:
         self._pictures: dict[int, tuple] = {}
 
     def _bsdf(self, start: Start) -> dict:
-        gloss = np.full((GLOSS_SIZE, GLOSS_SIZE, 1), START_SPECULAR, np.float32)
+        specular = np.full((SPECULAR_SIZE, SPECULAR_SIZE, 1), START_SPECULAR, np.float32)
         rough = np.full((2, 2, 1), START_ROUGHNESS, np.float32)
         albedo = np.ascontiguousarray(start.albedo, np.float32)
-        maps = {"albedo": albedo, "specular_intensity": gloss, "roughness": rough}
+        maps = {"albedo": albedo, "specular_intensity": specular, "roughness": rough}
         return {"type": "limn_skin_maps"} | {
             name: {"type": "bitmap", "bitmap": self.mi.Bitmap(array), "raw": True, "wrap_mode": "clamp"}
             for name, array in maps.items()
@@ -141,8 +141,8 @@ class PeerSolver:
         found = {name: np.array(self.average[name]) for name in RANGES}
         albedo = found["albedo"].astype(np.float32)
         size = (len(albedo), len(albedo))
-        gloss, rough = (cv2.resize(found[name][..., 0], size) for name in ("specular_intensity", "roughness"))
-        return {"diffuse_albedo": albedo, "specular_intensity": gloss, "roughness": rough}
+        specular, rough = (cv2.resize(found[name][..., 0], size) for name in ("specular_intensity", "roughness"))
+        return {"diffuse_albedo": albedo, "specular_intensity": specular, "roughness": rough}
 
     def set_light(self, latlong: np.ndarray) -> None:
         """Starts from a light [LIGHT_HEIGHT, 2 LIGHT_HEIGHT, 3] in the layout of shared.rendering.envmap."""

@@ -53,8 +53,8 @@ def verdicts(rows: Sequence[Mapping], perturbations: Sequence[Perturbation]) -> 
     for perturbation in perturbations:
         own = [(severity, known.get(perturbation.make(severity).digest)) for severity in perturbation.severities]
         run = [(0.0, zero)] + [(severity, row) for severity, row in own if row]
-        found += [{"dial": perturbation, "severity": severity, **row, "verdict": judge(perturbation.says, row, zero)}
-                  for severity, row in run if len(run) > 1]
+        found += [{"perturbation": perturbation, "severity": severity, **row,
+                   "verdict": judge(perturbation.says, row, zero)} for severity, row in run if len(run) > 1]
     return found
 
 
@@ -125,6 +125,7 @@ class StressBench(Bench):
         rows = self._verdicts(table)
         if rows:
             (self.options.out / "stress.svg").write_text(stress_picture(rows), encoding="utf-8")
-        bad = [f"{row['dial'].name} {row['severity']:g}" for row in rows if row["verdict"].word in (SILENT, FAILED)]
+        wrong = [row for row in rows if row["verdict"].word in (SILENT, FAILED)]
+        bad = [f"{row['perturbation'].name} {row['severity']:g}" for row in wrong]
         print(f"{len(rows)} rows; wrong and silent, or failed: {', '.join(bad) or 'none'}")
         return 1 if bad else 0

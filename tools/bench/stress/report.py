@@ -35,7 +35,7 @@ def shown_row(row: dict) -> dict:
     """A line of stress.csv."""
     verdict, scores = row["verdict"], row["scores"]
     return {
-        "dial": row["dial"].name, "severity": f"{row['severity']:g}", "unit": row["dial"].unit,
+        "perturbation": row["perturbation"].name, "severity": f"{row['severity']:g}", "unit": row["perturbation"].unit,
         "verdict": verdict.word, "wrong": " ".join(verdict.wrong), "said": "; ".join(verdict.said),
         **{name: f"{scores[name]:.4g}" for name in _SHOWN if scores.get(name) is not None},
         "gates_missed": "; ".join(row["missed_gates"]), "warnings": "; ".join(row["warnings"]), "exit": row["exit"],
@@ -65,7 +65,7 @@ def page(rows: Sequence[dict], missing: Sequence[str], code: str) -> str:
         "wrong. Gates that the case at 0 misses, which do not count: "
         f"{'; '.join(rows[0]['missed_gates']) or 'none'}.",
         "",
-        "| dial | severity | " + " | ".join(LIMITS) + " | verdict | what Limn said |",
+        "| perturbation | severity | " + " | ".join(LIMITS) + " | verdict | what Limn said |",
         "|---|---|" + "---|" * len(LIMITS) + "---|---|",
         *(_line(row, zero, row["code"] != code) for row in rows if row["severity"]),
     ]
@@ -77,7 +77,7 @@ def page(rows: Sequence[dict], missing: Sequence[str], code: str) -> str:
 
 
 def _line(row: dict, zero: dict, old: bool) -> str:
-    verdict, scores, perturbation = row["verdict"], row["scores"], row["dial"]
+    verdict, scores, perturbation = row["verdict"], row["scores"], row["perturbation"]
     cells = []
     for name in LIMITS:
         value = scores.get(name)
@@ -94,7 +94,7 @@ def _number(value: float | None) -> str:
 
 def stress_picture(rows: Sequence[dict]) -> str:
     """Every score over severity, a panel a perturbation, and below what Limn said; rows: of verdicts, in order."""
-    panels = [_panel(list(own)) for _, own in groupby(rows, key=lambda row: row["dial"].name)]
+    panels = [_panel(list(own)) for _, own in groupby(rows, key=lambda row: row["perturbation"].name)]
     lines = -(-len(panels) // _PANELS)
     placed = [f'<g transform="translate({k % _PANELS * _WIDTH} {k // _PANELS * _HEIGHT})">{panel}</g>'
               for k, panel in enumerate(panels)]
@@ -107,7 +107,7 @@ def stress_picture(rows: Sequence[dict]) -> str:
 
 def _panel(rows: list[dict]) -> str:
     """One perturbation: the axes, a curve a score, a square a severity in the colour of its verdict."""
-    perturbation, count, bottom = rows[0]["dial"], len(rows), _TOP + _PLOT[1]
+    perturbation, count, bottom = rows[0]["perturbation"], len(rows), _TOP + _PLOT[1]
     across = _LEFT + 8 + np.arange(count) * (_PLOT[0] - 16) / max(count - 1, 1)
     down = Axis(1.0 / _RANGE, _RANGE, bottom, _TOP, logarithmic=True)
     parts = [text(_LEFT, 14, perturbation.name.replace("_", " "), more=' class="name"')]

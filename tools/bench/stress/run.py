@@ -29,7 +29,7 @@ from tools.scoring.score import score
 
 SETTINGS = {
     "sample_frames": {},
-    "track_landmarks": {"start_frames": 24, "references": 1, "flow_tracks": 600, "tracks": 1000, "texel": 1.5},
+    "track_landmarks": {"start_frames": 24, "references": 1, "flow_tracks": 600, "tracks": 1000, "texel_px": 1.5},
     "init_albedo": {"size": 256, "frames": 12},
     "inverse_render": {"map_size": 256, "light_resolution": 8, "points": 1200, "directions": 512, "bounce_nodes": 300,
                        "light_frames": 24, "render_count": 1, "shape": False, "local_roughness": False},
@@ -59,7 +59,7 @@ def run_case(subject: Path, out: Path, pipeline: Pipeline) -> dict:
     seconds = sum(record["wall_s"] for record in records)
     return {"exit": 0, "message": "", "seconds": seconds, "scores": scores_of(subject, run),
             "warnings": warnings_of(records), "gates": gates, "missed_gates": missed,
-            "signs": (read_record(run.published("inverse_render") / "solve.json") or {}).get("signs", {})}
+            "diagnostics": (read_record(run.published("inverse_render") / "solve.json") or {}).get("diagnostics", {})}
 
 
 def _run_stage(name: str, subject: Path, out: Path) -> tuple[int, str]:

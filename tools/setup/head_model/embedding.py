@@ -2,7 +2,7 @@
 mesh.
 
 The networks answer a little differently for each view, light and face, so the place of a landmark is the
-median over many renderings, and its spread there decides how much the landmark may be trusted.
+median over many renderings, and its spread there decides the landmark's weight.
 """
 
 from dataclasses import dataclass
