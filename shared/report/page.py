@@ -127,7 +127,7 @@ def comparison_frame(frame: Frame) -> dict:
 
 
 def map_picture(name: str, values: np.ndarray) -> Figure:
-    """A map [S, S] or [S, S, 3] with what its colours mean."""
+    """A map, values [S, S] or [S, S, 3], with what its colours mean."""
     title, text = _MAP_TEXTS.get(name, (name, ""))
     codes, high = map_bytes(name, shrunk(np.asarray(values, np.float32), MAP_PIXELS))
     height, width = values.shape[:2]
@@ -135,7 +135,7 @@ def map_picture(name: str, values: np.ndarray) -> Figure:
 
 
 def map_bytes(name: str, values: np.ndarray) -> tuple[np.ndarray, float]:
-    """-> uint8 picture of a map and the value that is shown as white."""
+    """-> uint8 picture of a map, values [S, S] or [S, S, 3], and the value that is shown as white."""
     if name == "confidence":
         return viridis_bytes(values, 0.0, 1.0), 1.0
     if name == "normal":
@@ -152,7 +152,7 @@ def _one(picture: np.ndarray | None, longest: int, alt: str, text: str) -> Figur
 
 
 def light_pictures(envmap: np.ndarray) -> list[Figure]:
-    """The environment map [H, W, 3] as exposed and four stops darker."""
+    """The environment map, envmap [H, W, 3] linear, as exposed and four stops darker."""
     picture = shrunk(envmap, LIGHT_PIXELS)
     return [Figure(jpeg_uri(srgb_bytes(picture * gain)), f"environment map {text}", text=text)
             for gain, text in ((1.0, "as the camera exposed it"), (1 / 16, "four stops darker, to see into the lamps"))]

@@ -82,6 +82,8 @@ def test_what_the_documents_name_is_there(path):
     assert commands <= set(limn_commands()), commands - set(limn_commands())
     parameters = {f"{stage.name}.{p.name}" for stage in pipeline.stages.values() for p in stage.parameters}
     assert set(re.findall(rf"\b((?:{'|'.join(pipeline.stages)})\.[a-z][a-z_]+)=", text)) <= parameters
+    named = {name for name in re.findall(r"`([a-z][a-z_]+)=[^`]*`", text) if path.name != "reproducibility.md"}
+    assert named <= {name.partition(".")[2] for name in parameters}  # there it is the code that is changed
     assert set(re.findall(r"--preset ([a-z]+)", text)) <= set(pipeline.presets)
     files = re.findall(r"`((?:shared|stages|tools|tests|profiles|container|docs)/[\w/.]*)`", text)
     assert [name for name in files if not (README.parent / name).exists()] == []

@@ -153,9 +153,9 @@ def test_the_fast_renderer_agrees_with_brute_force():
     outgoing = np.array([0, 0, 950.0]) - points.position
     outgoing = (outgoing / np.linalg.norm(outgoing, axis=1, keepdims=True)).astype(np.float32)
     specular, roughness = np.full(150, 0.8, np.float32), np.full(150, 0.45, np.float32)
-    specular = specular_radiance(surface, light, irradiance, turn, points, outgoing, roughness,
-                            LobeSamples.draw(light, turn, 128, 128, rng), np.arange(150) % 64)
-    fast = np.array(ALBEDO) / np.pi * sample_bilinear(irradiance, points.uv) + 0.8 * specular
+    reflected = specular_radiance(surface, light, irradiance, turn, points, outgoing, roughness,
+                                  LobeSamples.draw(light, turn, 128, 128, rng), np.arange(150) % 64)
+    fast = np.array(ALBEDO) / np.pi * sample_bilinear(irradiance, points.uv) + 0.8 * reflected
     slow, error = reference_radiance(surface, light, turn, points, outgoing, specular, roughness, 1500, seed=4)
     assert np.abs(fast.mean(0) / slow.mean(0) - 1).max() < 0.01
     tolerance = 4 * error + 0.03 * slow.mean()
