@@ -125,7 +125,7 @@ def test_what_is_only_seen_near_the_heads_border_says_little():
 
 def test_errors_of_highlights_count_by_their_share():
     """Highlights that are a share q of a texel's light leave the rest's logarithm uncertain by 10 % of q / (1 - q);
-    where they exceed all the light, as in hair that is given a skin's gloss, nothing is left to be known."""
+    where they exceed all the light, as in hair with a skin's specular intensity, nothing is left to be known."""
     albedo, specular = np.array([0.2, 0.2, 0.002, 0.0]), 0.5
     reflection = np.array([0.0, 0.1, 0.3, 0.0])
     irradiance = np.where(albedo > 0, 1.0, 0.0)

@@ -39,7 +39,7 @@ def even_light(radiance=1.0):
 
 
 def test_even_light_shows_the_albedo():
-    """White furnace: a convex body without gloss under radiance 1 shows its albedo everywhere, from everywhere."""
+    """White furnace: a convex body without highlights under radiance 1 shows its albedo everywhere, from everywhere."""
     views = HeadViews(ball(), ball_maps(0.0), SIZES)
     for yaw, pitch in NOVEL_VIEWS.values():
         picture = views.render(even_light(), [orbit_camera(ball(), yaw, pitch, PIXELS)])[0]
@@ -47,7 +47,7 @@ def test_even_light_shows_the_albedo():
         np.testing.assert_allclose(middle, ALBEDO, rtol=0.01)
 
 
-def test_gloss_adds_its_share():
+def test_specular_adds_its_share():
     """Seen head-on under even light the lobe sum is the directional albedo of the lobe, near the hemispherical one."""
     views = HeadViews(ball(), ball_maps(1.0), SIZES)
     picture = views.render(even_light(), [orbit_camera(ball(), 0.0, 0.0, PIXELS)])[0]

@@ -100,7 +100,7 @@ def variation_of(capture, segment, **candidates):
     return SpecularSelection(capture, settings, trial, segment, allowed, records.append).select(), records
 
 
-def test_gloss_that_differs_by_segment_is_found_and_worn(one_thread):
+def test_specular_that_differs_by_segment_is_found_and_used(one_thread):
     capture = make_truth(roughness_at=glossy_forehead)[0]
     height = capture.points.positions[:, 1]
     forehead = (height > np.median(height)).astype(int)
@@ -114,7 +114,7 @@ def test_gloss_that_differs_by_segment_is_found_and_worn(one_thread):
     assert found[forehead == 1].mean() < 0.93 * 1.1 * ROUGHNESS < 1.05 * 1.1 * ROUGHNESS < found[forehead == 0].mean()
 
 
-def test_one_gloss_everywhere_stays_one(one_thread):
+def test_one_specular_everywhere_stays_one(one_thread):
     capture = make_truth()[0]
     segment = (capture.points.positions[:, 0] > 0.0).astype(int)
     variation, records = variation_of(capture, segment)

@@ -99,6 +99,12 @@ class TestHost:
         assert "libabsent.so.9" in (line := capsys.readouterr().out) and "apt-get install" in line
         assert "libabsent9" in line and line.count("\n") == 1
 
+    def test_without_pymeshlab_neither_it_nor_its_libraries_are_asked_for(self, monkeypatch, capsys):
+        monkeypatch.setitem(host.APT_PACKAGES, "libabsent.so.9", "libabsent9")
+        monkeypatch.setattr(host.importlib.util, "find_spec", lambda name: None if name == "pymeshlab" else name)
+        assert "pymeshlab" not in host.wheels_asked_for() and "cv2" in host.wheels_asked_for()
+        assert host.main() == 0 and capsys.readouterr().out == ""
+
 
 class TestRelaxation:
     """The solver of the texture layout, on a grid of triangles over the unit square."""

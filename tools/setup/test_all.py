@@ -29,6 +29,7 @@ LOCKED = (*PIP, "--require-hashes", "--requirement")
 LLVM = "libLLVM-19.so"
 PEERS = ("mitsuba==3.9.1", "drjit==1.5.0")
 BPY = "bpy==5.0.1"
+SIDE_BY_SIDE = ("--numprocesses", "2", "--dist", "loadfile")
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ def main(words: list[str]) -> int:
     print("\n".join(missing) or "all optional parts are installed", flush=True)
     if words[:1] == ["--only-install"]:
         return bool(missing)
-    command = [sys.executable, "-m", "pytest", "-rs", *words]
+    command = [sys.executable, "-m", "pytest", "-rs", *SIDE_BY_SIDE, *words]
     code = subprocess.run(command, cwd=REPOSITORY, env=environment()).returncode
     print("\n".join(missing))
     return code or bool(missing)

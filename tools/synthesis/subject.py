@@ -58,7 +58,8 @@ class SynthesisSettings:
     level: subdivisions of the head model. noise: standard deviation of the sensor at full scale. lights: the clip's,
     then those of relight/. truth_frames: how many frames get all buffers. mantissa_bits: precision of the truth on
     disk. face_truth_only: gt/mesh.obj holds the face without the rest of the head. chart: a colour chart stands beside
-    the head, and the picture is half as wide again to hold it. gloss: factor on the specular intensity; 0: matte.
+    the head, and the picture is half as wide again to hold it. specular_scale: factor on the specular intensity;
+    0: matte.
     """
 
     size: int = 400
@@ -79,7 +80,7 @@ class SynthesisSettings:
     face_truth_only: bool = False
     video: str = "video.avi"
     chart: bool = False
-    gloss: float = 1.0
+    specular_scale: float = 1.0
     irradiance: IrradianceQuality = IrradianceQuality()
     picture: PictureQuality = PictureQuality()
 
@@ -99,7 +100,7 @@ def synthesize(destination: Path, settings: SynthesisSettings, processes: int) -
         raise InputError("holds a subject already", where=str(destination), hint="choose another folder or remove it")
     head = random_head(head_model(settings.level), settings.seed, settings.eyes == "closed")
     materials = SkinPainter(head, settings.texture, settings.seed).paint(Complexion(tone=settings.tone))
-    materials = replace(materials, specular=settings.gloss * materials.specular)
+    materials = replace(materials, specular=settings.specular_scale * materials.specular)
     lights = tuple(light_of(name, settings) for name in settings.lights)
     distance, height = camera_place(head, settings)
     chart = place_chart(distance, height, settings.seed) if settings.chart else None
@@ -210,13 +211,14 @@ def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
     parser.add_argument("--yaw", dest="yaw_deg", type=float, help="how far the head turns to each side, degrees")
     parser.add_argument("--pitch", dest="pitch_deg", type=float, help="how far it nods up and down, degrees")
     parser.add_argument("--noise", type=float, help="sensor noise at full scale, share of it")
-    parser.add_argument("--gloss", type=float, help="factor on the skin's specular intensity; 0: matte")
+    parser.add_argument("--specular", dest="specular_scale", type=float,
+                        help="factor on the skin's specular intensity; 0: matte")
     parser.add_argument("--chart", action="store_true", help="a colour chart beside the head, in a wider picture")
     parser.add_argument("--processes", type=int, default=2, help="worker processes (default 2)")
     options = parser.parse_args(arguments)
     settings = PRESETS[options.preset]
     given = {name: getattr(options, name) for name in
-             ("size", "frames", "seed", "eyes", "tone", "noise", "focal_mm", "yaw_deg", "pitch_deg", "gloss")}
+             ("size", "frames", "seed", "eyes", "tone", "noise", "focal_mm", "yaw_deg", "pitch_deg", "specular_scale")}
     settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
     settings = replace(settings, chart=options.chart)
     if options.light:
@@ -228,7 +230,7 @@ def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
 def _checked(settings: SynthesisSettings) -> SynthesisSettings:
     for name, low, high in (("size", 64, 2048), ("frames", 8, 1000), ("seed", 0, 10**6), ("tone", 0.05, 2.0),
                             ("noise", 0.0, 0.1), ("focal_mm", 15.0, 500.0), ("yaw_deg", 0.0, 60.0),
-                            ("pitch_deg", 0.0, 40.0), ("gloss", 0.0, 2.0)):
+                            ("pitch_deg", 0.0, 40.0), ("specular_scale", 0.0, 2.0)):
         value = getattr(settings, name)
         if not low <= value <= high:
             raise InputError("out of range", where=f"--{name.split('_')[0]}", got=value, expected=f"{low} to {high}")
