@@ -268,12 +268,13 @@ def run(job: Job) -> None:
 
 def check(job: Job) -> None:
     """Maps in range, light positive, part of the map determined, re-renders that are not black."""
+    from shared.appearance.projection import SPECULAR_RANGE
     from shared.io.arrays import read_json
     from shared.io.images import read_exr
 
     maps = {path.stem: read_exr(path) for path in sorted((job.out / "maps").glob("*.exr"))}
     for name, image in maps.items():
-        highest = 2.0 if name == "specular_intensity" else 1.0
+        highest = SPECULAR_RANGE[1] if name == "specular_intensity" else 1.0
         if not (image.min() >= 0.0 and image.max() <= highest):
             raise LimnError(f"{name} leaves [0, {highest:g}]: {image.min():.3f} .. {image.max():.3f}")
     if not (maps["confidence"] > 0.5).mean() > 0.01:

@@ -23,6 +23,7 @@ from shared.appearance.problem import AppearanceProblem, AppearanceState
 from shared.appearance.projection import (
     ALBEDO_PULL,
     LARGEST_ROUGHNESS_STEP,
+    SPECULAR_RANGE,
     SpecularFit,
     best_albedo,
     changed_roughness,
@@ -253,7 +254,7 @@ class LinearisedFit:
             specular_fit = SpecularFit(settings, state, self.errors, irradiance, reflection, None, self.weight,
                                        self.evidence)
             albedo = self._albedo(state, irradiance, specular_fit.highlights)
-            state = replace(_with_albedo(state, albedo), specular=max(float(specular_fit.best[0]), 0.0))
+            state = replace(_with_albedo(state, albedo), specular=float(np.clip(specular_fit.best[0], *SPECULAR_RANGE)))
             return ResolvedFit(state, transport, irradiance, reflection, albedo, changed)
         albedo = self._albedo(state, irradiance, state.specular * reflection)
         log_albedo, log_irradiance, _ = problem.mean_on_skin(albedo, irradiance, transport)
@@ -273,7 +274,7 @@ class LinearisedFit:
         state = replace(
             _with_albedo(state, albedo),
             params=state.light_model.scaled(state.params, log_factor),
-            specular=specular if settings.specular else 0.0,
+            specular=float(np.clip(specular, *SPECULAR_RANGE)) if settings.specular else 0.0,
         )
         # What points of few samples are pulled to has the new scale, too.
         state = replace(state, albedo=state.albedo * np.exp(-log_factor))

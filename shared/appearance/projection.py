@@ -20,6 +20,8 @@ from shared.appearance.sample_errors import SampleErrors
 MINIMUM_ALBEDO, MAXIMUM_ALBEDO = 0.003, 1.0
 ALBEDO_PULL = 25.0
 """Precision of the prior on a point's albedo: a standard deviation of 0.2."""
+SPECULAR_RANGE = (0.0, 2.0)
+"""Of the specular intensity: at the upper end the reflectance at normal incidence is 0.08, twice skin's."""
 ROUGHNESS_RANGE, ROUGHNESS_SPREAD = (0.1, 0.7), 0.35
 """Of skin; the spread is the standard deviation of the prior on its logarithm, about where the fit starts."""
 LARGEST_ROUGHNESS_STEP = 0.08

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from shared.appearance.projection import SPECULAR_RANGE
 from shared.compute.compiled import compiled
 from shared.imaging.image_sampling import BALL_MM, is_inactive
 from shared.imaging.texels import TexelSamples, TexelSurface
@@ -291,7 +292,7 @@ def pooled_specular(
     spread = [_blurred(surface.to_image(x / CORRELATED_FRAMES), width) for x in (curvature, moment)]
     curvature, moment = (image.ravel()[surface.pixel] for image in spread)
     value = (POOL * moment + mean / sigma**2) / (POOL * curvature + 1.0 / sigma**2)
-    return np.clip(value, 0.0, 2.0).astype(np.float32)
+    return np.clip(value, *SPECULAR_RANGE).astype(np.float32)
 
 
 def _blurred(image: np.ndarray, width: float) -> np.ndarray:

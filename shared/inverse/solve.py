@@ -16,6 +16,7 @@ from shared.appearance.local_roughness import local_roughness
 from shared.appearance.maps import make_maps
 from shared.appearance.observations import Capture, build_capture
 from shared.appearance.problem import AppearanceProblem, AppearanceSettings
+from shared.appearance.projection import SPECULAR_RANGE
 from shared.appearance.texture_pass import TexturePass
 from shared.capture.chart import ChartObservation
 from shared.compute.run_context import SILENT, RunContext
@@ -210,7 +211,8 @@ def specular_at(surface: TexelSurface, solution: Solution) -> float | np.ndarray
     """The specular intensity that texels start from: one, or each its own [T]."""
     if solution.local_specular is None:
         return solution.state.specular
-    return np.clip(solution.local_specular.specular_at(surface.interpolate(surface.mesh.vertices)), 0.0, 2.0)
+    intensity = solution.local_specular.specular_at(surface.interpolate(surface.mesh.vertices))
+    return np.clip(intensity, *SPECULAR_RANGE)
 
 
 def describe_light(state) -> str:

@@ -107,6 +107,15 @@ def test_a_step_leaves_its_state_as_it_was(truth):
     assert first.appearance.roughness == second.appearance.roughness != appearance.roughness
 
 
+@pytest.mark.parametrize("start", [0.1, 0.7])
+def test_specular_intensity_stays_in_its_range(start):
+    """Highlights far stronger than skin's, while the roughness moves and once it rests: 2 at most, as the maps hold."""
+    capture = make_truth(specular=6.0)[0]
+    problem, state = under_true_light(capture, replace(GLOSSY, specular_prior=(2.0, 3.0), roughness=start))
+    found, _ = step(problem, FitState(state, problem.errors), highlights_count=True)
+    assert found.appearance.specular == 2.0
+
+
 def test_projected_albedo_is_weighted_least_squares(matte):
     """Albedo under the true light by brute force, and the truth itself to the noise."""
     capture, albedo, _ = matte
