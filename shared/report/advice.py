@@ -62,6 +62,7 @@ _ADVICE = (
      "Nothing in the clip shows this. Film a wider turn, or treat maps and light there as a guess."),
     (r"around the mouth|expression|smil|blink",
      "Film again with a relaxed, closed mouth and a steady gaze, without talking."),
+    (r"(is|are) blurred", "Turn more slowly, with a shorter exposure, and keep the face in focus."),
     (r"view of the head|turn|rotat|yaw|parallax",
      "Film a turn of at least 30 degrees to each side; depth and highlights come from it."),
     (r"px high|resolution|pixels wide|px wide", "Fill more of the frame with the head: 600 pixels or more are good."),
