@@ -4,16 +4,21 @@ import csv
 
 import numpy as np
 import pytest
+from shapes import sphere
 
+from shared.geometry.mesh import vertex_normals
 from shared.geometry.transforms import project, rigid, vector_from_rotation
 from shared.imaging.color import decode_srgb
-from shared.io.arrays import read_json
+from shared.io.arrays import load_arrays, read_json, save_arrays
+from shared.io.images import read_exr, read_png, write_exr, write_png
+from shared.io.meshes import read_obj, write_obj
+from shared.rendering.envmap import latlong_lookup
 from tools.bench.runner import Table, run
 from tools.bench.stress.bench import StressBench, missing_cases, verdicts
 from tools.bench.stress.camera import Sensor, compressed, defocused, drift, photograph, shaken, smeared
 from tools.bench.stress.perturbations import PERTURBATIONS, Perturbation, StressCase
 from tools.bench.stress.scenes import StressScene, smile_of
-from tools.bench.stress.subject import sliding_landmarks, wrong_poses
+from tools.bench.stress.subject import mirror_truth, sliding_landmarks, wrong_poses
 from tools.bench.stress.verdict import FAILED, LIMITS, RIGHT, SAID, SILENT, WARNED, judge
 from tools.synthesis.head import head_turn
 
@@ -86,6 +91,40 @@ def test_a_shaking_camera_moves_pictures_as_its_poses_say():
     assert np.array_equal(turned[[0, 3]], poses[[0, 3]]) and np.allclose(moved[[0, 3]], pictures[[0, 3]], atol=1e-4)
     expected = np.stack([spot(pose) for pose in turned])
     assert np.abs(moved - expected).max() < 0.03 < np.abs(pictures - expected)[[1, 2, 4, 5]].max()
+
+
+def test_the_truth_of_mirrored_pictures_is_mirrored(tmp_path):
+    """Points of the mirrored head appear where the mirrored picture shows them, normals point outwards still, and twice
+    mirrored is as before; what the files link to stays."""
+    kept, folder = tmp_path / "scene", tmp_path / "gt"
+    (kept / "frames").mkdir(parents=True)
+    (folder / "frames").mkdir(parents=True)
+    lens, size = np.array([[300.0, 0, 40], [0, 300.0, 40], [0, 0, 1]]), 80
+    ball, poses, rng = sphere(50.0, 2), head_turn(5, 600.0, -20.0, 0), np.random.default_rng(0)
+    normals = rng.normal(size=(size, size, 3)).astype(np.float32)
+    write_obj(kept / "mesh.obj", ball)
+    write_exr(kept / "frames" / "0000_normal.exr", normals, colour_space="data")
+    write_png(kept / "frames" / "0000_mask.png", np.uint8(255 * (normals[..., 0] > 0)))
+    for file in (kept / "mesh.obj", *sorted((kept / "frames").iterdir())):
+        (folder / file.relative_to(kept)).symlink_to(file)
+    save_arrays(folder / "poses.npz", camera_from_head=poses, K=lens)
+    light = rng.uniform(size=(8, 16, 3)).astype(np.float32)
+    write_exr(folder / "envmap.exr", light, colour_space="lin_rec709_scene", latlong=True)
+    mirror_truth(folder)
+    mesh, turned = read_obj(folder / "mesh.obj"), load_arrays(folder / "poses.npz")["camera_from_head"]
+    assert np.linalg.det(turned[:, :3, :3]) == pytest.approx(1.0)
+    pixels = project(mesh.vertices, turned[3], lens)[0]
+    assert np.allclose([size, 0] + [-1, 1] * pixels, project(ball.vertices, poses[3], lens)[0], atol=1e-2)
+    assert ((vertex_normals(mesh.vertices, mesh.faces) * mesh.vertices).sum(1) > 0).all()
+    expected = normals[:, ::-1] * [-1, 1, 1]
+    assert np.array_equal(read_exr(folder / "frames" / "0000_normal.exr"), expected.astype(np.float32))
+    sky = latlong_lookup(read_exr(folder / "envmap.exr"), ball.vertices / 50.0)
+    assert np.allclose(sky, latlong_lookup(light, ball.vertices / 50.0 * [-1, 1, 1]), atol=1e-2)
+    mirror_truth(folder)
+    assert np.array_equal(read_obj(folder / "mesh.obj").faces, read_obj(kept / "mesh.obj").faces)
+    assert np.allclose(load_arrays(folder / "poses.npz")["camera_from_head"], poses)
+    assert np.array_equal(read_png(folder / "frames" / "0000_mask.png"), read_png(kept / "frames" / "0000_mask.png"))
+    assert np.array_equal(read_exr(kept / "frames" / "0000_normal.exr"), normals)
 
 
 def test_compression_is_worse_the_lower_its_quality():

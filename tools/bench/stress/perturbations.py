@@ -24,7 +24,8 @@ class StressCase:
 
     pose_error_deg: of poses that come with the subject and are held. landmark_slide: how far landmarks that come with
     the subject lie off at the widest turn, as a share of the face's width; None: none come. keep: how many frames are
-    left, 0: all. shake_px: turn of the camera from frame to frame.
+    left, 0: all. shake_px: turn of the camera from frame to frame. mirrored: as some front cameras write
+    pictures, which then show the mirrored head: what Limn gives is compared with that.
     """
 
     mix: tuple[tuple[StressScene, float], ...] = ((StressScene(), 1.0),)
@@ -34,6 +35,7 @@ class StressCase:
     landmark_slide: float | None = None
     keep: int = 0
     shake_px: float = 0.0
+    mirrored: bool = False
 
     @property
     def digest(self) -> str:
@@ -111,6 +113,8 @@ PERTURBATIONS = (
     Perturbation("swapped_lens", "focal length and sensor width swapped", "of 1", (1.0,),
                  lambda s: StressCase(focal_gain=math.exp(s * 2.0 * math.log(SENSOR_MM / SETTINGS.focal_mm))),
                  r"focal"),
+    Perturbation("mirrored", "pictures that the camera mirrored", "of 1", (1.0,),
+                 lambda s: StressCase(mirrored=bool(s)), r"mirror"),
     Perturbation("narrow_turn", "a turn too small", "degrees short of the usual 27", (15.0, 22.0),
                  lambda s: _seen(yaw_deg=27.0 - s, pitch_deg=max(12.0 - 0.5 * s, 2.0)), r"changes by only|turn"),
     Perturbation("wide_turn", "a wide turn", "degrees beyond the usual 27", (18.0,),

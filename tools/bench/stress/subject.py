@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
 from shared.geometry.transforms import project, rotation_from_vector
 from shared.io.arrays import load_arrays, save_arrays
-from shared.io.images import read_exr, write_png
+from shared.io.images import read_exr, read_png, write_exr, write_png
+from shared.io.meshes import read_obj, write_obj
 from tools.bench.stress.camera import image_motion, photograph, shaken
 from tools.bench.stress.perturbations import StressCase
 from tools.bench.stress.scenes import SETTINGS, camera, render_scene
@@ -19,6 +22,8 @@ from tools.synthesis.head import smooth_random
 from tools.synthesis.subject import FPS, SENSOR_MM
 
 VIDEO = "frames/%04d.png"
+MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+"""Left and right exchanged, in head space as in the camera's axes."""
 
 
 def make_subject(case: StressCase, folder: Path, scenes: Path) -> Path:
@@ -40,8 +45,10 @@ def make_subject(case: StressCase, folder: Path, scenes: Path) -> Path:
         pictures, poses[kept] = shaken(pictures, poses[kept], camera().intrinsics, case.shake_px, known)
     motion = image_motion(poses, camera().intrinsics, points)[kept]
     for number, codes in enumerate(photograph(pictures, motion, case.sensor)):
-        write_png(folder / (VIDEO % number), codes)
+        write_png(folder / (VIDEO % number), codes[:, ::-1] if case.mirrored else codes)
     _write_truth(folder / "gt", parts, kept, poses)
+    if case.mirrored:
+        mirror_truth(folder / "gt")
     tracking = _given_tracking(case, folder, poses[kept], points)
     output.write_description(folder, camera(), SETTINGS.focal_mm, SENSOR_MM, len(kept), FPS, VIDEO)
     description = yaml.safe_load((folder / "subject.yaml").read_text(encoding="utf-8"))
@@ -79,6 +86,31 @@ def _write_truth(folder: Path, parts: list[tuple[Path, float]], kept: np.ndarray
     still = [(path, gain) for path, gain in parts if not path.name.startswith("cap")]
     light = sum(gain * read_exr(path / "gt" / "envmap.exr") for path, gain in still)
     output.write_environment(folder / "envmap.exr", light)
+
+
+def mirror_truth(folder: Path) -> None:
+    """Makes the truth in gt/ that of the mirrored head in mirrored light, before a camera whose principal point is in
+    the middle."""
+    mesh = read_obj(folder / "mesh.obj")
+    _replace(folder / "mesh.obj", write_obj, mesh.replace(
+        vertices=mesh.vertices * MIRROR.diagonal()[:3], faces=mesh.faces[:, ::-1], face_uvs=mesh.face_uvs[:, ::-1]))
+    poses = load_arrays(folder / "poses.npz")
+    save_arrays(folder / "poses.npz", **{**poses, "camera_from_head": MIRROR @ poses["camera_from_head"] @ MIRROR})
+    output.write_environment(folder / "envmap.exr", read_exr(folder / "envmap.exr")[:, ::-1])
+    for file in sorted((folder / "frames").iterdir()):
+        if file.suffix == ".png":
+            _replace(file, write_png, read_png(file)[:, ::-1])
+            continue
+        image = read_exr(file)[:, ::-1]
+        if file.stem.endswith("_normal"):
+            image = image * np.float32([-1.0, 1.0, 1.0])
+        _replace(file, lambda path, content: write_exr(path, content, colour_space="data", half=False), image)
+
+
+def _replace(file: Path, write: Callable[[Path, Any], None], content: Any) -> None:
+    """In place of a link into the scene, which other subjects share."""
+    file.unlink()
+    write(file, content)
 
 
 def _given_tracking(case: StressCase, folder: Path, poses: np.ndarray, points: np.ndarray) -> dict:
