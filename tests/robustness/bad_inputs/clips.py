@@ -17,6 +17,7 @@ from toy_video import write_sound, write_video
 
 from bad_inputs.cases import case, write_settings
 from shared.geometry.raycast import RayScene
+from shared.imaging.color import decode_srgb
 from shared.io.arrays import load_arrays
 from shared.io.images import read_exr, read_png
 from shared.io.meshes import read_obj
@@ -227,9 +228,15 @@ def ten_bits(folder):
     write_video(folder / "clip.mkv", head(), codec="ffv1", pixel_format="yuv420p10le", matrix=None)
 
 
+def pq_codes(rgb: np.ndarray) -> np.ndarray:
+    """uint8 sRGB -> uint8 codes that show the same light on a display of 1000 cd/m2 (ITU-R BT.2100-2, table 4)."""
+    power = (0.1 * decode_srgb(rgb / 255.0)) ** 0.1593017578125
+    return np.uint8(np.round(255.0 * ((0.8359375 + 18.8515625 * power) / (1.0 + 18.6875 * power)) ** 78.84375))
+
+
 @case("HDR transfer")
 def hdr(folder):
-    write_video(folder / "clip.mp4", head(), colour={"color_trc": 16, "color_primaries": 9})
+    write_video(folder / "clip.mp4", [pq_codes(rgb) for rgb in head()], colour={"color_trc": 16, "color_primaries": 9})
 
 
 @case("Display P3")
