@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sparse
 
 from shared.rendering.envmap import cube_directions, cube_lookup, cube_smoothness, cube_solid_angles, frame_lookup
 
@@ -42,6 +43,10 @@ class FrameLight:
         self.resolution, self.shape = resolution, (len(directions), len(world_from_head))
         self._lookup = frame_lookup(directions, world_from_head, resolution, light_index).astype(np.float32)
         self._transposed = self._lookup.T.tocsr()
+
+    def of_frame(self, frame: int) -> sparse.csr_matrix:
+        """[J, K]: the texels' radiance along each direction in a frame."""
+        return self._lookup[frame :: self.shape[1]]
 
     def along(self, light: np.ndarray) -> np.ndarray:
         """Radiance of the texels [K, C] -> along each direction in each frame [J, F, C] float32."""
@@ -76,6 +81,13 @@ class LogPrior:
 
         cost = priors.smooth * priors.edge**2 * float((root - 1.0).sum()) + 0.5 * float((white * chroma**2).sum())
         return cost, self._differences.T @ (weight * step) + white * chroma, product
+
+    def curvature(self, log_light: np.ndarray, priors: LightPriors) -> list[sparse.csr_matrix]:
+        """The Hessian's blocks [K, K] of each channel by itself at log_light [K, C]."""
+        step, channels = self._differences @ log_light, log_light.shape[1]
+        weight = priors.smooth / np.sqrt(1.0 + (step / priors.edge) ** 2)
+        white = sparse.diags(priors.white * self._solid * (1.0 - 1.0 / channels))
+        return [(self._differences.T @ sparse.diags(own) @ self._differences + white).tocsr() for own in weight.T]
 
 
 def resample_light(light: np.ndarray, resolution: int) -> np.ndarray:

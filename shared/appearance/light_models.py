@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import scipy.sparse as sparse
 from scipy.special import sph_harm_y
 
 from shared.appearance.light import LightPriors, LogPrior, resample_light
@@ -83,6 +84,10 @@ class LogLight:
         """Cost, gradient [M, 3] and Hessian product of the regularisers, which act on the log radiance."""
         cost, gradient, product = self.log_prior(self._log(params), priors)
         return cost, self._log_adjoint(gradient), lambda change: self._log_adjoint(product(self._log(change)))
+
+    def prior_curvature(self, params: np.ndarray, priors: LightPriors) -> list[sparse.csr_matrix] | None:
+        """Of parameters [M, 3] that are texels: the prior's Hessian [M, M] of each channel by itself; else None."""
+        return self.log_prior.curvature(params, priors) if self.basis is None else None
 
     def fit(self, radiance: np.ndarray) -> np.ndarray:
         """Parameters whose light comes closest to a cubemap radiance [6 m^2, 3] of any resolution, in the logarithm
@@ -161,6 +166,10 @@ class LampLight:
 
         return cost + 0.5 * float((away * (lamp - lamp.mean())).sum()), result, whole
 
+    def prior_curvature(self, params: np.ndarray, priors: LightPriors) -> None:
+        """None: the parameters are no texels."""
+        return None
+
     def fit(self, radiance: np.ndarray) -> np.ndarray:
         """The lamp takes what exceeds the median of a cubemap around its brightest direction, the sky the rest.
         radiance [6 m^2, 3] linear."""
@@ -225,12 +234,23 @@ class SeveralLights:
         cost = sum(share * own for share, own in zip(self.shares, costs, strict=True))
         return cost, self._weighted(gradients), product
 
+    def prior_curvature(self, params: np.ndarray, priors: LightPriors) -> list[sparse.csr_matrix] | None:
+        """Of parameters [L M, 3] that are texels: the prior's Hessian [L M, L M] of each channel by itself; else None.
+        """
+        each = [self.model.prior_curvature(own, priors) for own in np.split(params, self.count)]
+        if each[0] is None:
+            return None
+        return [sparse.block_diag(self._scaled(own), format="csr") for own in zip(*each, strict=True)]
+
     def with_shares(self, shares: Sequence[float]) -> SeveralLights:
         """The same with other weights [L] of their priors."""
         return SeveralLights(self.model, self.count, shares)
 
     def _weighted(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        return np.concatenate([share * part for share, part in zip(self.shares, parts, strict=True)])
+        return np.concatenate(self._scaled(parts))
+
+    def _scaled(self, parts: Sequence) -> list:
+        return [share * part for share, part in zip(self.shares, parts, strict=True)]
 
     def fit(self, radiance: np.ndarray) -> np.ndarray:
         """Parameters whose lights come closest to cubemaps radiance [L 6 m^2, 3] of any resolution, one below the

@@ -19,6 +19,7 @@ import torch
 from scipy.sparse.linalg import LinearOperator, cg
 
 from shared.appearance.albedo_scale import resolve_scale
+from shared.appearance.preconditioner import MOST_TEXELS, LightPreconditioner, curvature_of_some
 from shared.appearance.problem import AppearanceProblem, AppearanceState
 from shared.appearance.projection import (
     ALBEDO_PULL,
@@ -222,7 +223,8 @@ class LinearisedFit:
             matvec=lambda x: level_transposed(self.product(level(x.reshape(params.shape)))).ravel(),
         )
         # Ended long before, what remains hangs on roundings: 1e-7 in products of single precision comes out as 1e-2.
-        solved, _ = cg(hessian, -level_transposed(self.gradient()).ravel(), rtol=tolerance, atol=0.0, maxiter=count)
+        solved, _ = cg(hessian, -level_transposed(self.gradient()).ravel(), rtol=tolerance, atol=0.0, maxiter=count,
+                       M=self._preconditioner())
         whole = level(solved.reshape(params.shape))
         longest = max(whole.max() / _LARGEST_RISE, -whole.min() / _LARGEST_FALL, 1.0)
         steps = [whole]
@@ -236,6 +238,18 @@ class LinearisedFit:
                 shorter = min(1.0, LARGEST_ROUGHNESS_STEP / max(abs(changes[best]), 1e-9))
                 return params + shorter * halving * steps[best], before
         return params, before
+
+    def _preconditioner(self) -> LinearOperator | None:
+        """Of the step's system, [3 M, 3 M]; None where the light's parameters are no texels, or too many."""
+        state, params = self.state, self.state.params
+        prior = state.light_model.prior_curvature(params, self.problem.settings.priors)
+        if prior is None or len(params) > MOST_TEXELS:
+            return None
+        curvature = curvature_of_some(self.transport, self.albedo, state.specular, self.irradiance,
+                                      self.evidence * self.weight)
+        solve = LightPreconditioner(curvature, state.light, prior)
+        return LinearOperator((params.size, params.size), dtype=np.float64,
+                              matvec=lambda x: solve(x.reshape(params.shape)).ravel())
 
     def resolved_scale(self, params: np.ndarray) -> ResolvedFit:
         """Roughness, specular intensity, the light's scale and the albedo for a light of parameters [M, 3], weights as

@@ -94,6 +94,15 @@ class Transport:
             result += specular * reflect(self.lobes.weights, along)
         return result
 
+    def rows(self, frame: int, points: np.ndarray, albedo: torch.Tensor, specular: float, channel: int) -> np.ndarray:
+        """[n, K] float32: derivative of render by the texels, of points [n] int in one frame and channel, of albedo
+        [3, P, 1]."""
+        chosen = torch.from_numpy(points)
+        rows = albedo[channel, chosen] * self.total[channel, chosen]
+        if self.lobes is not None:
+            rows = rows + specular * self.lobes.weights[frame, chosen].float()
+        return np.ascontiguousarray((self.frame_light.of_frame(frame).T @ rows.numpy().T).T)
+
     def render_adjoint(self, values: torch.Tensor, albedo: torch.Tensor, specular: float) -> np.ndarray:
         """Transpose of render: values [3, P, F], albedo [3, P, 1] -> [K, 3]."""
         return self.frame_light.adjoint(self._along_adjoint(values, albedo, specular).contiguous().numpy())
