@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -82,9 +83,8 @@ class VertexShading:
         self.material, self.directions = material, directions
         self.points, self.transfer = points, transfer
         self.table = SpecularTransfer(points.normals, transfer.visibility(), directions)
-        self.stand_in = _stand_ins(vertices, index, transfer.blocked, deep)
-        self._node_direct = node_transfer.direct.astype(np.float32)
-        self._radiosity = node_radiosity(node_transfer, material.bounce_albedo()).astype(np.float32) if bounce else None
+        self._vertices, self._index, self._deep = vertices, index, deep
+        self._nodes = node_transfer if bounce else None
         self._key_step = key_step
         self._light(light, camera_from_head, moves, light_index)
 
@@ -98,7 +98,7 @@ class VertexShading:
         self.light_along = light_along(light, self.directions, world_from_head(camera_from_head, moves), light_index)
         shape = (len(self.points), len(camera_from_head), 3)
         direct = irradiance(self.transfer, self.light_along.reshape(len(self.directions), -1))
-        bounces = self._radiosity is not None
+        bounces = self._nodes is not None
         bounced = bounced_irradiance(self.transfer, self._sent_by_nodes()) if bounces else np.zeros_like(direct)
         total = direct + bounced
         self._irradiance = total.reshape(shape).astype(np.float16)
@@ -113,9 +113,14 @@ class VertexShading:
 
     def _sent_by_nodes(self) -> np.ndarray:
         """[K, F * 3]: the nodes' radiosity over pi, with all diffuse bounces."""
-        channels = range(self.light_along.shape[-1])
-        sent = [self._radiosity[..., c] @ (self._node_direct @ self.light_along[..., c]) for c in channels]
-        return np.stack(sent, axis=-1).reshape(len(self._node_direct), -1)
+        flat = self.light_along.reshape(len(self.directions), -1)
+        direct = irradiance(self._nodes, flat).reshape(-1, *self.light_along.shape[1:])
+        return node_radiosity(self._nodes, self.material.bounce_albedo(), direct).reshape(len(direct), -1)
+
+    @cached_property
+    def stand_in(self) -> np.ndarray:
+        """[V]: for each vertex the place in index of the nearest shaded vertex in the open, its own where it is one."""
+        return _stand_ins(self._vertices, self._index, self.transfer.blocked, self._deep)
 
     def irradiance(self, frame: int) -> np.ndarray:
         """E [V, 3] float32 over pi."""
@@ -191,7 +196,7 @@ class VertexShading:
 
 
 def _stand_ins(vertices: np.ndarray, index: np.ndarray, blocked: np.ndarray, deep: float) -> np.ndarray:
-    """[V]: for each vertex the place in index of the nearest shaded vertex in the open, its own where it is one."""
+    """What VertexShading.stand_in says."""
     open_points = np.nonzero(blocked < deep)[0]
     if len(open_points) == 0:
         open_points = np.arange(len(index))

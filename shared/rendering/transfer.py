@@ -178,14 +178,17 @@ def trace_transfer(
     return Transfer(direct, bounce, blocked, visible)
 
 
-def node_radiosity(nodes: Transfer, albedo: np.ndarray) -> np.ndarray:
-    """[K, K, C] matrices M with radiosity (albedo * E) of the nodes = M[..., c] @ (direct @ L): all diffuse bounces.
+def node_radiosity(nodes: Transfer, albedo: np.ndarray, direct: np.ndarray) -> np.ndarray:
+    """The nodes' radiosity b = albedo * E over pi, with all diffuse bounces, under direct irradiance e over pi, both
+    [K, C] or [K, N, C].
 
-    nodes: the transfer of the nodes themselves (bounce is [K, K]); albedo [K, C]. Solves (I - diag(a) B) M = diag(a).
+    nodes: the transfer of the nodes themselves (bounce B is [K, K]); albedo a [K, C]. Solves (I - diag(a) B) b = a e.
     """
     form = nodes.bounce.astype(np.float64)
-    identity = np.eye(len(form))
-    solved = [np.linalg.solve(identity - a[:, None] * form, np.diag(a)) for a in albedo.T.astype(np.float64)]
+    solved = []
+    for c, own in enumerate(albedo.T.astype(np.float64)):
+        sent_on = own[:, None] * direct[..., c].reshape(len(form), -1)
+        solved.append(np.linalg.solve(np.eye(len(form)) - own[:, None] * form, sent_on).reshape(direct.shape[:-1]))
     return np.stack(solved, axis=-1)
 
 

@@ -17,6 +17,7 @@ from shared.appearance.local_roughness import SpecularEquations
 from shared.appearance.observations import face_front
 from shared.appearance.problem import AppearanceSettings
 from shared.compute.run_context import SILENT, RunContext
+from shared.compute.threads import share_out
 from shared.geometry.mesh import Mesh, subdivide, vertex_normals
 from shared.geometry.surface import TrackPoints
 from shared.imaging.image_sampling import SurfaceViewer
@@ -41,6 +42,7 @@ SHAPED = ("forehead", "brows", "lids", "nose", "cheek_left", "cheek_right", "upp
 """Segments whose samples shape the surface. Ears, neck and scalp follow them; what HELD names stays the model's."""
 HELD = ("eyes", "inner_mouth", "eye_sockets")
 MINIMUM_FRAMES, FEWEST_POINTS = 4, 50
+_POINTS_PER_BLOCK = 1024
 BLUR_EDGES = 0.4
 """Standard width of the pictures' blur over the typical edge: what a vertex stands for."""
 
@@ -120,8 +122,17 @@ class Traced:
 
     def turned_to(self, normals: np.ndarray) -> Transfer:
         """The transfer for other normals [P, 3] under the same visibility."""
-        cosine = np.maximum(normals @ self.precomputed.directions.T, 0.0) * (4.0 / len(self.precomputed.directions))
-        return replace(self.transfer, direct=(cosine * self.transfer.visibility()).astype(np.float16))
+        directions = self.precomputed.directions.T.astype(np.float32)
+        directions *= np.float32(4.0 / directions.shape[1])
+        normals, direct = normals.astype(np.float32), np.empty_like(self.transfer.direct)
+        blocks = [slice(first, first + _POINTS_PER_BLOCK) for first in range(0, len(direct), _POINTS_PER_BLOCK)]
+
+        def fill(k: int) -> None:
+            part = blocks[k]
+            direct[part] = np.maximum(normals[part] @ directions, 0.0) * self.transfer.visibility(part)
+
+        share_out(len(blocks), fill)
+        return replace(self.transfer, direct=direct)
 
 
 class ShapeSolver:

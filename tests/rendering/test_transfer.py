@@ -51,9 +51,8 @@ def traced_bowl():
 
 def lit(nodes, transfer, albedo, light):
     """E over pi [P, C] with all bounces; albedo [C] everywhere, light [J, C]."""
-    matrices = node_radiosity(nodes, np.tile(albedo, (len(nodes.direct), 1)))
     direct = nodes.direct.astype(np.float64) @ light
-    radiosity = np.stack([matrices[..., c] @ direct[:, c] for c in range(light.shape[1])], axis=1)
+    radiosity = node_radiosity(nodes, np.tile(albedo, (len(nodes.direct), 1)), direct)
     return irradiance(transfer, light, radiosity)
 
 
@@ -116,7 +115,8 @@ def test_radiosity_is_the_sum_of_all_bounces(traced_bowl):
     _, _, nodes, _ = traced_bowl
     albedo = np.random.default_rng(0).uniform(0.1, 0.9, (len(nodes.direct), 2))
     form = nodes.bounce.astype(np.float64)
-    exact = node_radiosity(nodes, albedo)
+    count = len(form)
+    exact = node_radiosity(nodes, albedo, np.tile(np.eye(count)[..., None], 2))
     for c in range(2):
         operator = albedo[:, c, None] * form
         assert operator.sum(1).max() < 0.6

@@ -102,8 +102,7 @@ class TracedView:
         direct = nodes.direct.astype(np.float64) @ self.along
         radiosity = [None, colour * direct, None][bounces]
         if bounces == 2:
-            matrices = node_radiosity(nodes, np.tile(colour, (len(direct), 1)))
-            radiosity = np.stack([matrices[..., c] @ direct[:, c] for c in range(3)], axis=1)
+            radiosity = node_radiosity(nodes, np.tile(colour, (len(direct), 1)), direct)
         return self._picture(irradiance(self.transfer, self.along, radiosity), None, albedo)
 
     def specular(self, roughness: float, split: bool) -> np.ndarray:
