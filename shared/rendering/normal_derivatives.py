@@ -18,6 +18,7 @@ import scipy.sparse as sparse
 import torch
 from scipy.spatial import cKDTree
 
+from shared.compute.threads import share_out
 from shared.geometry.mesh import normalised, tangent_frames
 from shared.rendering.lobes import specular_reflection
 from shared.rendering.shading import VertexShading
@@ -27,6 +28,7 @@ NORMAL_STEP = 0.06
 """Radians between the normals whose reflections are differenced: half the spacing of 768 directions."""
 ANCHORS = 3000
 NEIGHBOURS, CLOSEST_MM = 4, 0.5
+_POINTS_PER_BLOCK = 512
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,11 @@ class ShadingTerms:
     irradiance_turn: np.ndarray
     reflection_turn: np.ndarray
     shadow_slope: np.ndarray
+
+    def points(self, index: slice) -> ShadingTerms:
+        """The terms of some points."""
+        arrays = (self.tangents, self.irradiance, self.reflection, self.irradiance_turn, self.reflection_turn)
+        return ShadingTerms(*(array[index] for array in arrays), self.shadow_slope[index])
 
 
 class IrradianceVectors:
@@ -90,7 +97,7 @@ class Reflections:
         level = value - np.einsum("acx,ax->ac", slope, self.normals)
         both = self.carry[rows] @ np.concatenate([level, slope.reshape(-1, 9)], axis=1)
         slope = both[:, 3:].reshape(-1, 3, 3)
-        return np.maximum(both[:, :3] + np.einsum("pcx,px->pc", slope, normals), 0.0), slope
+        return np.maximum(both[:, :3] + (slope @ normals[..., None])[..., 0], 0.0), slope
 
     def _at_anchors(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         shading = self.shading
@@ -117,14 +124,17 @@ def shading_terms(shading: VertexShading, rows: np.ndarray, reflections: Reflect
     tangents = tangent_frames(normals).astype(np.float32)
     vectors = IrradianceVectors(shading.transfer.visibility(rows), shading.directions, shading.light_along)
     along = vectors.frames(slice(None))
-    turn = np.einsum("pfcx,pkx->pfck", along, tangents)
-    shadow = shadow_slope(shading.points.take(rows), along)
     shape = (len(rows), shading.light_along.shape[1], 3)
+    turn = (along.reshape(len(rows), -1, 3) @ tangents.transpose(0, 2, 1)).reshape(shape + (2,))
+    shadow = shadow_slope(shading.points.take(rows), along)
     reflection, reflection_turn = np.zeros(shape, np.float32), np.zeros(shape + (2,), np.float32)
+
+    def reflect(f: int) -> None:
+        reflection[:, f], slope = reflections.at(f, normals, rows)
+        reflection_turn[:, f] = slope @ tangents.transpose(0, 2, 1)
+
     if reflections is not None:
-        for f in range(shape[1]):
-            reflection[:, f], slope = reflections.at(f, normals, rows)
-            reflection_turn[:, f] = np.einsum("pcx,pkx->pck", slope, tangents)
+        share_out(shape[1], reflect)
     return ShadingTerms(tangents, shading.irradiance_of_points(rows), reflection, turn, reflection_turn, shadow)
 
 
@@ -134,10 +144,18 @@ def shadow_slope(points: Points, vectors: np.ndarray) -> np.ndarray:
     vectors [P, F, 3 channels, 3]: W. Where a border lies is known no better than visibility and shape are.
     """
     distance, near = cKDTree(points.positions).query(points.positions, k=min(1 + NEIGHBOURS, len(points)))
-    total = np.zeros(vectors.shape[:3], np.float32)
-    for k in range(1, near.shape[1]):
-        between = normalised(points.normals + points.normals[near[:, k]]).astype(np.float32)
-        change = np.einsum("pfcx,px->pfc", vectors[near[:, k]] - vectors, between)
-        total += np.square(change / np.maximum(distance[:, k], CLOSEST_MM)[:, None, None].astype(np.float32))
-    return np.sqrt(total / NEIGHBOURS)
+    result = np.zeros(vectors.shape[:3], np.float32)
+    blocks = [slice(first, first + _POINTS_PER_BLOCK) for first in range(0, len(result), _POINTS_PER_BLOCK)]
+
+    def fill(block: int) -> None:
+        part = blocks[block]
+        for k in range(1, near.shape[1]):
+            other = near[part, k]
+            between = normalised(points.normals[part] + points.normals[other]).astype(np.float32)
+            between /= np.maximum(distance[part, k], CLOSEST_MM)[:, None].astype(np.float32)
+            change = (vectors[other] - vectors[part]).reshape(len(other), -1, 3) @ between[..., None]
+            result[part] += np.square(change).reshape(result[part].shape)
+
+    share_out(len(blocks), fill)
+    return np.sqrt(result / NEIGHBOURS)
 

@@ -22,6 +22,7 @@ import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
 from shared.compute.robust import cauchy_weight
+from shared.compute.threads import share_out
 from shared.imaging.image_sampling import is_inactive
 from shared.rendering.normal_derivatives import ShadingTerms
 from shared.rendering.transfer import spread_vertices
@@ -31,6 +32,7 @@ from shared.tracking.depth_noise import PATCH_MM
 MINIMUM_ALBEDO, MAXIMUM_ALBEDO, TYPICAL_ALBEDO = 0.003, 1.0, 0.3
 CAUCHY_SCALE = 2.5
 PATCHES, CHI_SQUARED_MEDIAN_1 = 1000, 0.455
+_POINTS_PER_BLOCK = 512
 LARGEST_SQUARED_ERROR = 0.01
 """A sample that is off by more than a tenth of full scale shows something else than the surface."""
 
@@ -91,37 +93,53 @@ def point_equations(
     fitted: np.ndarray,
     settings: EquationSettings,
 ) -> PointEquations:
-    """Equations of P points [P, 3] with normals [P, 3]; specular: intensity, one or [P]; fitted [F] bool."""
-    specular = np.broadcast_to(np.asarray(specular, np.float32), (len(points),))[:, None, None]
-    highlights = specular * terms.reflection
-    uncertainty = settings.shadow_mm * terms.shadow_slope
-    albedo, weight = _fit_albedo(samples, terms.irradiance, highlights, fitted, settings.noise, uncertainty)
-    model = albedo[:, None] * terms.irradiance + highlights
-    error = model - samples.colours
-    rms = _rms(error, samples, fitted)
-    weight = weight * fitted[:, None]
+    """Equations of P points [P, 3] with normals [P, 3]; specular: intensity, one or [P]; fitted [F] bool. Points are
+    shared out in blocks, whose arrays stay in the cache."""
+    specular = np.broadcast_to(np.asarray(specular, np.float32), (len(points),))
+    blocks = [slice(first, first + _POINTS_PER_BLOCK) for first in range(0, len(points), _POINTS_PER_BLOCK)]
+
+    def fit(k: int) -> tuple[np.ndarray, ...]:
+        own, lit = samples.points(blocks[k]), terms.points(blocks[k])
+        highlights = specular[blocks[k], None, None] * lit.reflection
+        uncertainty = settings.shadow_mm * lit.shadow_slope
+        albedo, weight = _fit_albedo(own, lit.irradiance, highlights, fitted, settings.noise, uncertainty)
+        model = albedo[:, None] * lit.irradiance + highlights
+        error = model - own.colours
+        return albedo, weight * fitted[:, None], np.maximum(model, 1e-3), error, _squared_sums(error, own, fitted)
+
+    albedo, weight, scale, error, sums = zip(*share_out(len(blocks), fit), strict=True)
+    albedo, weight, scale, error = (np.concatenate(parts) for parts in (albedo, weight, scale, error))
     if settings.smooth_mm > 0:
-        scale = np.maximum(model, 1e-3)
         error = error - scale * SmoothField(points, settings.smooth_mm)(error / scale, weight * scale**2)
-    along = np.einsum("pfix,px->pfi", samples.pixels_per_mm, normals.astype(np.float32))
-    slopes = np.empty(error.shape + (3,), np.float32)
-    slopes[..., 0] = -np.einsum("pfci,pfi->pfc", samples.gradient.astype(np.float32), along)
-    turn = albedo[:, None, :, None] * terms.irradiance_turn
-    slopes[..., 1:] = turn + specular[..., None] * terms.reflection_turn
-    power = np.maximum((weight * terms.irradiance**2).sum(1), 1e-9)
-    weighted = weight * terms.irradiance
-    slopes -= terms.irradiance[..., None] * ((weighted[..., None] * slopes).sum(1) / power[..., None])[:, None]
-    error -= terms.irradiance * ((weighted * error).sum(1) / power)[:, None]
-    across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
-    null = -np.einsum("pfci,pfi->pfc", samples.gradient.astype(np.float32), across)
-    null -= terms.irradiance * ((weighted * null).sum(1) / power)[:, None]
-    evidence = np.float64(1.0 / variance_inflation(points, (weight * null * error).sum((1, 2)),
-                                                   (weight * null**2).sum((1, 2))))
-    rows = slopes.reshape(len(slopes), -1, 3)
-    scaled = rows * (evidence * weight).reshape(len(slopes), -1, 1)
-    hessian = np.swapaxes(scaled, 1, 2) @ rows
-    gradient = (scaled * error.reshape(len(slopes), -1, 1)).sum(1)
-    return PointEquations(hessian.astype(np.float64), gradient.astype(np.float64), albedo, *rms)
+
+    def linearise(k: int) -> tuple[np.ndarray, ...]:
+        part = blocks[k]
+        own, lit, used, off = samples.points(part), terms.points(part), weight[part], error[part]
+        gradient = own.gradient.astype(np.float32)
+        along = np.einsum("pfix,px->pfi", own.pixels_per_mm, normals[part].astype(np.float32))
+        across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
+        turn = albedo[part][:, None, :, None] * lit.irradiance_turn
+        turn += specular[part, None, None, None] * lit.reflection_turn
+        parallax, null = (-np.einsum("pfci,pfi->pfc", gradient, way) for way in (along, across))
+        weighted = used * lit.irradiance
+        power = np.maximum((weighted * lit.irradiance).sum(1), 1e-9)
+
+        def pure(values: np.ndarray) -> np.ndarray:
+            return values - lit.irradiance * ((weighted * values).sum(1) / power)[:, None]
+
+        off, null = pure(off), pure(null)
+        rows = np.stack([pure(values) for values in (parallax, turn[..., 0], turn[..., 1])], axis=-1)
+        rows = rows.reshape(len(rows), -1, 3)
+        scaled = np.swapaxes(rows * used.reshape(len(rows), -1, 1), 1, 2)
+        slope = (scaled @ off.reshape(len(rows), -1, 1))[..., 0]
+        return scaled @ rows, slope, (used * null * off).sum((1, 2)), (used * null**2).sum((1, 2))
+
+    hessian, gradient, wrong, power = (
+        np.concatenate(parts) for parts in zip(*share_out(len(blocks), linearise), strict=True)
+    )
+    evidence = 1.0 / variance_inflation(points, wrong, power)
+    return PointEquations(evidence * hessian.astype(np.float64), evidence * gradient.astype(np.float64), albedo,
+                          *_rms(np.sum(sums, axis=0)))
 
 
 def variance_inflation(points: np.ndarray, slope: np.ndarray, power: np.ndarray, radius_mm: float = PATCH_MM) -> float:
@@ -151,11 +169,13 @@ def _fit_albedo(samples, irradiance, highlights, fitted, noise, uncertainty) -> 
     return albedo, weight
 
 
-def _rms(error: np.ndarray, samples: SurfaceSamples, fitted: np.ndarray) -> tuple[float, float]:
-    """Trust-weighted rms residual of fitted and of held-out frames."""
+def _squared_sums(error: np.ndarray, samples: SurfaceSamples, fitted: np.ndarray) -> np.ndarray:
+    """[2, 2]: the sum of squared residuals by view weight, and of the weights, of fitted and of held-out frames."""
     squared = (np.minimum(error**2, LARGEST_SQUARED_ERROR) * ~is_inactive(samples.saturation, error)).sum(2)
-    result = []
-    for chosen in (fitted, ~fitted):
-        weight = samples.weight * chosen
-        result.append(float(np.sqrt((weight * squared).sum() / max(3.0 * weight.sum(), 1e-9))))
-    return result[0], result[1]
+    weights = [samples.weight * chosen for chosen in (fitted, ~fitted)]
+    return np.array([[(weight * squared).sum(dtype=float), weight.sum(dtype=float)] for weight in weights])
+
+
+def _rms(sums: np.ndarray) -> list[float]:
+    """Root mean square residual of fitted and of held-out frames; sums: as _squared_sums has them."""
+    return [float(np.sqrt(squared / max(3.0 * weight, 1e-9))) for squared, weight in sums]
