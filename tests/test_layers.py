@@ -27,7 +27,7 @@ MAY_IMPORT = {
     "shared.appearance": "compute geometry imaging capture rendering",
     "shared.shape": "compute geometry imaging tracking rendering appearance",
     "shared.selection": "appearance",
-    "shared.published": "geometry imaging rendering appearance",
+    "shared.published": "compute geometry imaging rendering appearance",
     "shared.inverse":
         "contract compute geometry imaging io capture tracking rendering appearance shape selection published",
     "shared.report": "contract geometry imaging io capture tracking rendering",

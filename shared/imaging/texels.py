@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sparse
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse.linalg import splu
 
 from shared.compute.compiled import compiled
+from shared.compute.sparse_solve import factorised
 from shared.geometry.mesh import Mesh, rasterize_uv, vertex_adjacency
 from shared.imaging.image_sampling import Picture, View, sample_colours, sample_inside, sample_saturation, texel_size
 
@@ -151,7 +151,7 @@ def smooth_field(
     result = np.empty(values.shape)
     for c, known in enumerate(precision.T):
         right = (values[:, c].reshape(count, -1).T * known + mean[c] / spread**2).T
-        solved = splu((prior + sparse.diags(known)).tocsc()).solve(right)
+        solved = factorised(prior + sparse.diags(known)).solve(right)
         result[:, c] = solved.reshape(result[:, c].shape)
     return result
 

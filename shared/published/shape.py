@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sparse
 import torch
-from scipy.sparse.linalg import splu
 
+from shared.compute.sparse_solve import factorised
 from shared.geometry.mesh import graph_laplacian, uniform_laplacian
 from shared.published.light import SparseOperator
 
@@ -23,7 +23,7 @@ class LargeSteps:
 
     def __init__(self, faces: np.ndarray, count: int, smoothing: float):
         self._matrix = (sparse.identity(count) + smoothing * graph_laplacian(faces, count)).tocsc()
-        self._solve = splu(self._matrix).solve
+        self._solve = factorised(self._matrix).solve
 
     def parameters(self, vertices: np.ndarray) -> np.ndarray:
         """[V, 3] -> u [V, 3]."""

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import scipy.sparse as sparse
-from scipy.sparse.linalg import splu
 
 from shared.compute.robust import cauchy_weight
 from shared.compute.run_context import SILENT, RunContext
+from shared.compute.sparse_solve import factorised
 from shared.geometry.mesh import Mesh, loop_subdivision, mesh_edges, normalised, vertex_normals
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import project, projection_slope
@@ -181,8 +181,7 @@ def _step(spread, prior, moved, contour: OccludingContour, fitted: np.ndarray, s
     weighted = rows.T @ sparse.diags(weight)
     matrix = weighted @ rows + sparse.block_diag([prior] * 3)
     gradient = weighted @ distance + (prior @ moved).T.ravel()
-    factor = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return factor.solve(-gradient).reshape(3, -1).T
+    return factorised(matrix).solve(-gradient).reshape(3, -1).T
 
 
 def _mean_distance(contour: OccludingContour, fitted: np.ndarray, settings: ContourSettings) -> tuple[float, float]:

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sparse
-from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from shared.compute.robust import ROBUST_SCALE, cauchy_weight
+from shared.compute.sparse_solve import factorised
 from shared.geometry.mesh import interpolate, uniform_laplacian, vertex_normals
 from shared.geometry.raycast import RayScene, on_faces
 from shared.tracking.depth_noise import DepthNoise
@@ -54,8 +54,7 @@ def fit_surface(
         wanted = interpolation @ (vertices - fit.vertices) + under.offset[:, None] * under.normal
         weighted = sparse.diags(under.weight) @ interpolation
         matrix = interpolation.T @ weighted + stiffness * plate + contact
-        factor = splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        vertices = fit.vertices + factor.solve(weighted.T @ wanted)
+        vertices = fit.vertices + factorised(matrix).solve(weighted.T @ wanted)
     return replace(fit, vertices=vertices)
 
 
