@@ -62,7 +62,7 @@ PUBLISHED = ParameterGroup(
 
 STAGE = Stage(
     name="inverse_render",
-    version=20,
+    version=21,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -95,6 +95,8 @@ STAGE = Stage(
         Parameter("fixed_parts", str, "", "Parts of the model that model=auto leaves as the other parameters say, "
                   "separated by commas: visibility, specular, light, geometry, roughness.", former="forced"),
         Parameter("points", int, 4000, "Surface points that the light is solved from.", "", 200, 40000),
+        Parameter("coarse_points", int, 1000, "As many of them on which the light comes to rest, before a last step on "
+                  "all; 0: all from the first step on.", "", 0, 40000),
         Parameter("directions", int, 768, "Directions over the sphere.", "", 128, 8192),
         Parameter("bounce_nodes", int, 1000, "Surface nodes that exchange bounced light.", "", 50, 6000),
         Parameter("light_frames", int, 48, "Frames that the light is solved from, spread evenly.", "frames", 3, 1000),
@@ -123,7 +125,7 @@ STAGE = Stage(
                   "person mask's border."),
         Parameter("shape_subdivisions", int, 1, "Times that the mesh is subdivided for that.", "", 0, 2),
         Parameter("shape_steps", int, 2, "Most steps of the shape per level.", "", 1, 20, former="shape_rounds"),
-        Parameter("shape_frames", int, 48, "Frames that the shape is solved from, spread evenly.", "frames", 3, 1000),
+        Parameter("shape_frames", int, 32, "Frames that the shape is solved from, spread evenly.", "frames", 3, 1000),
         Parameter("shape_smoothness", float, 19.0, "Lambda of the large steps: over how many edges, squared, the "
                   "surface moves together.", "", 0.0, 10000.0),
         Parameter("shape_sigma", float, 8.0, "Expected distance of the tracked mesh from the truth where it is wrong "

@@ -167,7 +167,7 @@ def fit_appearance(
         for number in range(settings.steps):
             counts = highlights_count and phase is Phase.SOLVING
             state, found = step(problem, state, counts, light_moves=number > 0 or not keep_start)
-            record = found.record(model, resolution, number, phase)
+            record = found.record(model, resolution, number, phase) | {"points": len(capture.points)}
             if kept is not None and found.rise > _LARGEST_RISE:
                 state, highlights_count = replace(state, appearance=kept[0]), False
                 records.append(record | {"undone": True})
@@ -196,6 +196,23 @@ def fit_appearance(
         appearance, tuple(records), fitted=found.fitted, held_out=found.held_out, highlights_count=highlights_count,
         frame_errors=found.frame_errors, light_weights=found.light_weights,
     )
+
+
+def fit_all_points(
+    capture: Capture,
+    settings: AppearanceSettings,
+    coarse: Solution,
+    report: Callable[[dict], None] = lambda record: None,
+) -> Solution:
+    """The solution of a whole capture from that of some of its points, whose light is at rest: roughness, strength of
+    highlights, scale and albedo under that light, then one step of everything, kept where it serves. Its records follow
+    the coarse one's.
+
+    Unknowns of the light are few beside samples even of a quarter of the points, and Gauss-Newton steps from there
+    converge at once; what takes many steps is the way to the first shape of the light, and roughness and scale in turn.
+    """
+    whole = fit_appearance(capture, replace(settings, steps=2), report, start=coarse, keep_start=True)
+    return replace(whole, iterations=coarse.iterations + whole.iterations)
 
 
 def step(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,6 +46,22 @@ class Capture:
     def frames_of_lights(self) -> list[np.ndarray]:
         """Of each light, the indices of its frames."""
         return frames_of_lights(self.light_index, len(self.world_from_head))
+
+    def take(self, index: np.ndarray) -> Capture:
+        """What it shows of the points index [n] int."""
+        return replace(
+            self,
+            points=self.points.take(index),
+            samples=self.samples.points(index),
+            transfer=self.transfer.take(index),
+            skin=self.skin[index],
+        )
+
+    def some_points(self, count: int) -> Capture:
+        """Of at most count points, spread evenly; itself where it has no more, or count is 0."""
+        if not 0 < count < len(self.points):
+            return self
+        return self.take(spread_vertices(self.points.positions, count))
 
 
 def face_front(viewer: SurfaceViewer, camera_from_head: np.ndarray, limit: float) -> np.ndarray:

@@ -23,8 +23,8 @@ import torch
 from shared.appearance.transport import Transport
 from shared.compute.threads import share_out
 
-POINTS = 128
-"""Twice as many save one iteration of eight, half of them cost three."""
+POINTS, FRAMES = 128, 24
+"""Twice as many points save one iteration of eight, half of them cost three; half of the frames cost three as well."""
 MOST_TEXELS = 3072
 """Of two lights, or a cubemap of 22: beyond, forming and factorising take longer than the iterations that they save."""
 _POINTS_AT_A_TIME = 32
@@ -66,9 +66,10 @@ def curvature_of_some(
     """
     points = np.unique(np.linspace(0, irradiance.shape[1] - 1, count).astype(int))
     chosen = torch.from_numpy(points)
-    frames = np.nonzero(weight.sum((0, 1)).numpy() > 0)[0]
+    counted = np.nonzero(weight.sum((0, 1)).numpy() > 0)[0]
+    frames = counted[np.unique(np.linspace(0, len(counted) - 1, FRAMES).astype(int))]
     part, lit = (values[:, chosen][..., frames].numpy() for values in (weight, irradiance))
-    part = part * np.float32(weight.sum() / weight[:, chosen].sum())
+    part = part * np.float32(float(weight.sum()) / float(part.sum()))
 
     def of_channel(c: int) -> np.ndarray:
         total = np.float32(0.0)

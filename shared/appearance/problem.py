@@ -43,7 +43,7 @@ class AppearanceSettings:
     """light_model: see light_models; resolutions: cubemap edge per stage of the solve; independent: how many of the
     samples count as independent evidence against the priors; noise: absolute (linear) and relative standard deviation
     of a sample; visibility: whether parts of the head cover each other; precision: most products of a step of the
-    light, and by how much its residual must fall."""
+    light, and by how much its residual must fall; coarse_points: see fit.fit_all_points, 0: all."""
 
     light_model: str = "cubemap"
     resolutions: tuple[int, ...] = (8, 16)
@@ -61,6 +61,7 @@ class AppearanceSettings:
     local_roughness: bool = True
     specular_prior: tuple[float, float] = (0.7, 0.25)
     precision: tuple[int, float] = (60, 0.0005)
+    coarse_points: int = 1000
 
     def light_moves(self, moves: str) -> str:
         """What moves against the light, in a clip in which the head or the camera moves: a lamp at the camera goes
@@ -147,13 +148,7 @@ class AppearanceProblem:
 
     def take(self, index: slice | np.ndarray) -> AppearanceProblem:
         """That of some of the points, under the whole one's prior."""
-        capture = replace(
-            self.capture,
-            points=self.capture.points.take(index),
-            samples=self.capture.samples.points(index),
-            transfer=self.capture.transfer.take(index),
-            skin=self.capture.skin[index],
-        )
+        capture = self.capture.take(index)
         table = SpecularTransfer(capture.points.normals, capture.transfer.visibility(), capture.directions)
         return AppearanceProblem(capture, self.settings, self.errors.take(index), table, self.node_to_point,
                                  self.skin_prior, self.direct[index])

@@ -231,6 +231,7 @@ SOLVE = (
     Field("iterations[].light", "The light's model.", "text", optional=True),
     Field("iterations[].resolution", "Edge of its cubemap faces.", "int", unit="texels", optional=True),
     Field("iterations[].step", "Number of the step at this resolution, from 0.", "int", optional=True),
+    Field("iterations[].points", "Surface points that it looked at.", "int", optional=True),
     Field("iterations[].shaping", "Whether highlights did not take part yet.", "bool", optional=True),
     Field("iterations[].undone", "Present where the step was undone.", "bool", optional=True),
     Field("iterations[].fitted", "Error on the fitted frames.", optional=True),

@@ -41,6 +41,7 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         fit_roughness=params.fit_roughness,
         local_roughness=params.local_roughness,
         specular_prior=(params.specular_prior, SPECULAR_SPREAD),
+        coarse_points=params.coarse_points,
     )
     contour = {} if params.silhouette else {"contour": None}
     shape = ShapeSettings(

@@ -10,7 +10,7 @@ import numpy as np
 from shared.appearance.chart_scale import ChartStatement, describe_scale, scale_warnings, state_chart
 from shared.appearance.diagnostics import diagnostic_warnings, diagnostics_of, face_regions
 from shared.appearance.fine_normals import NormalPass, resolved_texels
-from shared.appearance.fit import Solution, fit_appearance
+from shared.appearance.fit import Solution, fit_all_points, fit_appearance
 from shared.appearance.light_models import SeveralLights
 from shared.appearance.local_roughness import local_roughness
 from shared.appearance.maps import make_maps
@@ -77,7 +77,7 @@ def solve_clip(
     # Light on the mesh as it was tracked, or as model selection left it.
     lit = LitSurface.of(selected.surface, light_views, settings, chart, context)
     keeps_start = settings.selection is not None and selected.start is not None
-    solution = fit_appearance(lit.capture, settings.appearance, report_to(context), start=selected.start,
+    solution = fit_appearance(lit.coarse, settings.appearance, report_to(context), start=selected.start,
                               keep_start=keeps_start)
 
     # The mesh refined under that light, and the light anew; kept where held-out frames fit better.
@@ -92,11 +92,13 @@ def solve_clip(
             context=context,
         )
         lit_then = LitSurface.of(refined.surface, light_views, settings, chart, context, before=lit.surface.mesh)
-        then = fit_appearance(lit_then.capture, settings.appearance, report_to(context), start=solution)
+        then = fit_appearance(lit_then.coarse, settings.appearance, report_to(context), start=solution)
         shape_record = judge_shape(solution, then) | {"stopped_vertices": refined.stopped}
         context.note(f"refined mesh: {shape_record}")
         if shape_record["refined"]:
             lit, solution = lit_then, then
+    if lit.coarse is not lit.capture:
+        solution = fit_all_points(lit.capture, settings.appearance, solution, report_to(context))
     if selected.variation is not None:
         solution = selected.variation.worn_by(solution)
     diagnostics, solution = examine(lit, settings.appearance, solution)
@@ -136,12 +138,14 @@ def solve_clip(
 
 @dataclass(frozen=True, eq=False)
 class LitSurface:
-    """A surface ready for its light to be solved: its viewer, precomputed transfer, and what the skin's points show."""
+    """A surface ready for its light to be solved: its viewer, precomputed transfer, and what the skin's points show;
+    coarse: what some of them show, on which the light comes to rest."""
 
     surface: Surface
     viewer: SurfaceViewer
     precomputed: PrecomputedTransfer
     capture: Capture
+    coarse: Capture
 
     @classmethod
     def of(
@@ -159,7 +163,8 @@ class LitSurface:
         precomputed = precompute_transfer(viewer, settings.sizes, settings.appearance.visibility)
         moves, skin = settings.appearance.light_moves(views.moves), surface.vertices_of(FACE_SKIN)
         capture = build_capture(viewer, precomputed, views, moves, skin, settings.sizes.points, context)
-        return cls(surface, viewer, precomputed, replace(capture, chart=chart))
+        capture = replace(capture, chart=chart)
+        return cls(surface, viewer, precomputed, capture, capture.some_points(settings.appearance.coarse_points))
 
 
 def report_to(context: RunContext) -> Callable[[dict], None]:

@@ -56,7 +56,7 @@ class ShapeSettings:
 
     subdivisions: int = 1
     rounds: int = 2
-    frames: int = 48
+    frames: int = 32
     smoothness: float = 19.0
     sigma_mm: float = 8.0
     equations: EquationSettings = field(default_factory=EquationSettings)

@@ -17,7 +17,7 @@ from toy_capture import (
     true_light,
 )
 
-from shared.appearance.fit import fit_appearance
+from shared.appearance.fit import fit_all_points, fit_appearance
 from shared.appearance.problem import AppearanceSettings
 from shared.appearance.projection import changed_roughness
 from shared.contract.records import SOLVE
@@ -155,6 +155,45 @@ def test_a_fit_goes_on_from_a_solution(truth, solution):
     assert again.held_out < 1.02 * solution.held_out
     without = fit_appearance(truth[0], settings, start=replace(solution, highlights_count=False))
     assert not without.highlights_count and again.highlights_count
+
+
+def test_some_points_say_what_the_light_is_and_a_last_step_on_all_finishes(truth, monkeypatch):
+    """As the fit of all points from the first step on finds it, within its own error; steps of all points are
+    two, the first of them without a change of the light."""
+    from shared.appearance import fit as module
+
+    capture, albedo, _ = truth
+    settings = AppearanceSettings(resolutions=(4, 8), noise=(0.003, 0.01), roughness=0.45)
+    exact = fit_appearance(capture, settings)
+    some = capture.some_points(len(capture.points) // 4)
+    assert len(some.points) <= len(capture.points) // 4 and len(some.points) > 80
+    coarse = fit_appearance(some, settings)
+
+    honest, moved = module.step, []
+
+    def watched(problem, state, highlights_count, light_moves):
+        moved.append((len(problem.capture.points), light_moves))
+        return honest(problem, state, highlights_count, light_moves)
+
+    monkeypatch.setattr(module, "step", watched)
+    found = fit_all_points(capture, settings, coarse)
+    assert moved == [(len(capture.points), False), (len(capture.points), True)]
+    assert found.iterations[: len(coarse.iterations)] == coarse.iterations
+    assert [field_faults(record, below(SOLVE, "iterations[]")) for record in found.iterations] == (
+        [[]] * len(found.iterations)
+    )
+    assert found.state.albedo.shape == exact.state.albedo.shape
+    apart = np.abs(scale_free_error(found.state.albedo, exact.state.albedo))
+    errors = [np.median(np.abs(scale_free_error(fit.state.albedo, albedo))) for fit in (exact, found)]
+    assert np.median(apart) < errors[0] and errors[1] < 0.01
+    # The scale, of which strength and width of highlights say little, within what the priors leave open.
+    assert abs(np.log(np.median(found.state.albedo / exact.state.albedo))) < settings.white_sigma
+    assert found.held_out < 1.1 * exact.held_out
+
+
+def test_no_fewer_points_are_chosen_where_there_are_no_more(truth):
+    capture = truth[0]
+    assert capture.some_points(0) is capture and capture.some_points(len(capture.points)) is capture
 
 
 def test_a_step_that_leads_away_is_undone_and_ends_its_resolution(truth, monkeypatch):
