@@ -14,6 +14,15 @@ sys.path.insert(0, str(Path(__file__).parent / "helpers"))
 pytest_plugins = ["random_order"]
 
 
+@pytest.fixture(scope="session", autouse=True)
+def cache_of_the_tests(tmp_path_factory, worker_id):
+    """What the processes that tests start keep for each other lies with the tests' own files, not with the user's."""
+    folder = tmp_path_factory.getbasetemp()
+    os.environ["LIMN_CACHE"] = str((folder if worker_id == "master" else folder.parent) / "cache")
+    yield
+    del os.environ["LIMN_CACHE"]
+
+
 @pytest.fixture(scope="session")
 def tiny_run(tmp_path_factory, worker_id):
     """The folder (work/ and export/) of the tiny subject, from clip to export; made once for all workers."""

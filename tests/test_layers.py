@@ -58,7 +58,8 @@ MAY_IMPORT = {
 """Row: rows that it may import. Rows of shared are named without the prefix, and may all import shared.errors; `shared`
 stands for all of its rows."""
 HEAVY = {"numpy", "scipy", "torch", "cv2", "av", "pycolmap", "OpenEXR", "pxr", "matplotlib", "pymeshlab", "embreex"}
-TOUCH_THE_DISK = ("shared.contract", "shared.io", "shared.report.template", "shared.tracking.models")
+TOUCH_THE_DISK = ("shared.contract", "shared.io", "shared.report.template", "shared.tracking.models",
+                  "shared.compute.kept_code")
 """Packages and modules of the library that open files; all others take arrays and return arrays, or call these."""
 FILES = sorted(path for top in TOPS for path in (REPOSITORY / top).rglob("*.py"))
 PACKAGES = sorted(path.parent for path in FILES if path.name == "__init__.py")

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from shared.appearance.projection import SPECULAR_RANGE
-from shared.compute.compiled import compiled
+from shared.compute.compiled import compiled, compiled_part
 from shared.imaging.image_sampling import BALL_MM, is_inactive
 from shared.imaging.texels import TexelSamples, TexelSurface
 
@@ -262,7 +262,7 @@ def robust_weight(
     return weight
 
 
-_is_inactive = compiled(is_inactive)
+_is_inactive = compiled_part(is_inactive)
 
 
 @compiled

@@ -1,12 +1,15 @@
 """The state of the process on which a stage's last digits depend: threads of the libraries, the order of sets.
 
-Both are settled here, and only here, whether the workflow starts a stage or somebody does so by hand.
+Both are settled here, and only here, whether the workflow starts a stage or somebody does so by hand; and so is where
+compiled loops are kept from one stage to the next, which changes no result.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+
+from shared.contract.cache_folder import VARIABLE, cache_folder
 
 _READ_WHEN_LOADED = ("numpy", "scipy", "torch", "cv2", "numba")
 
@@ -31,6 +34,7 @@ def settle(threads: int) -> None:
     The libraries read it when they are loaded and Python when it starts. Where that has happened already (a stage file
     by hand imports numpy first), the interpreter starts anew with the same command line; else this returns.
     """
+    os.environ[VARIABLE] = cache_folder()
     wanted = settled_environment(threads)
     if any(os.environ.get(name) != value for name, value in wanted.items()):
         late = sys.flags.hash_randomization or any(name in sys.modules for name in _READ_WHEN_LOADED)

@@ -17,7 +17,7 @@ from copy import copy
 
 import numpy as np
 
-from shared.compute.compiled import compiled
+from shared.compute.compiled import compiled, compiled_part
 from shared.rendering.brdf import F0, MINIMUM_COSINE
 from shared.rendering.split_sum import SplitSum, narrowest_roughness
 
@@ -99,7 +99,7 @@ def blocks_of(table: SpecularTransfer) -> list[slice]:
     return [slice(start, start + _POINTS_PER_BLOCK) for start in range(0, len(table), _POINTS_PER_BLOCK)]
 
 
-@compiled
+@compiled_part
 def weigh_directions(normal, towards, alpha2, directions, weights):
     """One point's lobe on all directions [3, J] -> weights [J]: brdf.specular_cosine times the solid angle.
 
@@ -124,7 +124,7 @@ def weigh_directions(normal, towards, alpha2, directions, weights):
         weights[j] = factor * fresnel * cos_i / (masking * base * base)
 
 
-@compiled
+@compiled_part
 def cover_lobe(weights, visible):
     """Clears the weights [J] of directions that are not visible [J] and returns their sum."""
     every, seen = np.float32(0.0), np.float32(0.0)

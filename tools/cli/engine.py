@@ -19,6 +19,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from shared.contract.cache_folder import VARIABLE, cache_folder
 from shared.contract.folders import RunFolder
 from shared.contract.manifest import write_record
 from shared.contract.needs import scale_of
@@ -176,7 +177,8 @@ def engine_environment(home: Path) -> dict[str, str]:
     caches = {name: str(home / "tmp") for name in ("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME")}
     return kept | caches | {
         "PYTHONPATH": os.pathsep.join(filter(None, search)), "TMPDIR": str(home / "tmp"),
-        "PYTHONHASHSEED": "0"}  # so that the stages' interpreters need not start anew
+        "PYTHONHASHSEED": "0",  # so that the stages' interpreters need not start anew
+        VARIABLE: cache_folder()}  # of the user: that of the engine goes with its run
 
 
 def profile_folder(name: str) -> str:
