@@ -13,6 +13,7 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path, PurePosixPath
 
+from shared.contract.hashing import hash_file
 from shared.contract.manifest import PROVENANCE, read_record
 from shared.contract.source import CODE_SUFFIXES, fingerprint
 
@@ -30,7 +31,9 @@ def drift(folder: Path, roots: Sequence[Path]) -> list[str]:
     code, packages = record.get("code"), record.get("packages")
     if not _is_text(code) or not _is_text(packages) or not _is_text({"python": record.get("python")}):
         return ["it is not on record which code and packages made it"]
-    files = [name for name, was in code.items() if _fingerprint_of(name, tuple(roots)) != was]
+    known, where = _sources(record), tuple(roots)
+    files = [name for name, was in code.items()
+             if known.get(name, "") != _source_of(name, where) and _fingerprint_of(name, where) != was]
     versions = {"Python": record["python"], **packages}
     others = [f"{name} {was} -> {_version(name)}" for name, was in sorted(versions.items())
               if name not in IDLE_PACKAGES and _version(name) != was]
@@ -40,6 +43,12 @@ def drift(folder: Path, roots: Sequence[Path]) -> list[str]:
     if others:
         remarks.append(f"packages have changed: {_shortened(others)}")
     return remarks
+
+
+def _sources(record: Mapping[str, object]) -> Mapping[str, str]:
+    """Hashes of the files as they were; none under another Python, which gives the same text another fingerprint."""
+    sources = record.get("sources")
+    return sources if _is_text(sources) and record["python"] == platform.python_version() else {}
 
 
 def _is_text(values: object) -> bool:
@@ -53,13 +62,27 @@ def _shortened(names: Sequence[str]) -> str:
     return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
+def _file_of(name: str, roots: tuple[Path, ...]) -> Path | None:
+    relative = PurePosixPath(name)
+    if relative.is_absolute() or ".." in relative.parts or relative.suffix not in CODE_SUFFIXES:
+        return None
+    return next((root / relative for root in roots if (root / relative).is_file()), None)
+
+
+@cache
+def _source_of(name: str, roots: tuple[Path, ...]) -> str | None:
+    """SHA-256 of the file as it is now, None where it is gone or no file of ours."""
+    try:
+        path = _file_of(name, roots)
+        return hash_file(path) if path else None
+    except (ValueError, OSError):
+        return None
+
+
 @cache
 def _fingerprint_of(name: str, roots: tuple[Path, ...]) -> str:
     """Of the file as it is now, '' where it is gone, damaged or no file of ours."""
-    relative = PurePosixPath(name)
-    if relative.is_absolute() or ".." in relative.parts or relative.suffix not in CODE_SUFFIXES:
-        return ""
-    path = next((root / relative for root in roots if (root / relative).is_file()), None)
+    path = _file_of(name, roots)
     try:
         return fingerprint(path) if path else ""
     except (SyntaxError, ValueError, OSError):

@@ -18,7 +18,7 @@ from shared.contract.manifest import LOG, MANIFEST, PROVENANCE, Work, output_ent
 from shared.contract.progress import Reporter
 from shared.contract.provenance import Meter, environment
 from shared.contract.request import Request
-from shared.contract.source import loaded_code
+from shared.contract.source import loaded_code, loaded_sources
 from shared.contract.sums import write_sums
 from shared.errors import InputError, LimnError
 
@@ -86,8 +86,8 @@ def _do(request: Request, work: Work, run: Callable[[Job], None], check: Callabl
     write_record(temporary / MANIFEST, {**work.content(), "key": work.key, "outputs": entries})
     size = sum(path.stat().st_size for path in temporary.rglob("*") if path.is_file())
     volatile = volatile_entries(temporary, entries)
-    provenance = {**cost, **environment(), "code": loaded_code(request.roots), "threads": request.threads,
-                  "warnings": reporter.warnings, "bytes": size, "volatile": volatile}
+    provenance = {**cost, **environment(), "code": loaded_code(request.roots), "sources": loaded_sources(request.roots),
+                  "threads": request.threads, "warnings": reporter.warnings, "bytes": size, "volatile": volatile}
     write_record(temporary / PROVENANCE, provenance)
     reporter.write_log(f"done in {cost['wall_s']} s, peak memory {cost['peak_memory_mb']} MB")
     reporter.close()

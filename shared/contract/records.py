@@ -321,6 +321,7 @@ PROVENANCE = (
     Field("kernels.**", "For which processor each library chose its loops, and the variables that decided on it.", ""),
     Field("packages.<package>", "Version of each package that was loaded.", "text"),
     Field("code.<file>", "Hash of each of Limn's files that was loaded, comments and layout apart.", "text"),
+    Field("sources.<file>", "Hash of each of these files as it lies there.", "text"),
     Field("command", "The command line.", "text", "N"),
     Field("warnings", "Warnings of the stage.", "text", "W"),
     Field("bytes", "Size of all its files.", "int", unit="bytes"),

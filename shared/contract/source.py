@@ -16,6 +16,7 @@ from pathlib import Path
 from types import CodeType
 
 from shared.contract.declare import Stage
+from shared.contract.hashing import hash_file
 from shared.errors import InputError, LimnError
 
 _STANDARD_LIBRARY = sysconfig.get_path("stdlib")
@@ -46,8 +47,8 @@ def read_declaration(path: Path) -> Stage:
     return stage
 
 
-def loaded_code(roots: Sequence[Path]) -> dict[str, str]:
-    """{file relative to the first of the folders that holds it: fingerprint} of the modules loaded from there.
+def loaded_files(roots: Sequence[Path]) -> dict[str, Path]:
+    """{file relative to the first of the folders that holds it: its path} of the modules loaded from there.
 
     A module that fills templates names their folder, TEMPLATES: its files count as the module's own. This package and
     all that is installed are left out.
@@ -62,8 +63,18 @@ def loaded_code(roots: Sequence[Path]) -> dict[str, str]:
         root = next((root for root in roots if path.is_relative_to(root)), None)
         if root is not None and path.suffix in CODE_SUFFIXES and not path.is_relative_to(_STANDARD_LIBRARY):
             names.setdefault(path.relative_to(root).as_posix(), path)
-    return {name: fingerprint(path) for name, path in names.items()
+    return {name: path for name, path in names.items()
             if not name.startswith((".", "shared/contract/")) and _INSTALLED.isdisjoint(path.parts)}
+
+
+def loaded_code(roots: Sequence[Path]) -> dict[str, str]:
+    """{file: fingerprint} of the same."""
+    return {name: fingerprint(path) for name, path in loaded_files(roots).items()}
+
+
+def loaded_sources(roots: Sequence[Path]) -> dict[str, str]:
+    """{file: SHA-256} of the same. A file whose bytes are those of before needs no fingerprint to be the same code."""
+    return {name: hash_file(path) for name, path in loaded_files(roots).items()}
 
 
 def fingerprint(path: Path) -> str:

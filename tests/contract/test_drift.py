@@ -16,7 +16,7 @@ from shared.contract import Stage, main, models
 from shared.contract import drift as drift_module
 from shared.contract.drift import drift
 from shared.contract.manifest import read_manifest
-from shared.contract.source import loaded_code
+from shared.contract.source import loaded_code, loaded_sources
 from tools.limn import main as limn_main
 
 OLD_NUMPY = "1.0.0"
@@ -68,6 +68,32 @@ def test_a_template_is_code_of_the_module_that_fills_it(tmp_path, monkeypatch):
     page.write_text("<b>{{ text }}</b>")
     drift_module._fingerprint_of.cache_clear()
     assert drift(tmp_path, roots) == ["code has changed: templates/page.html.j2"]
+
+
+def test_a_file_whose_bytes_are_those_of_before_is_not_compiled(tmp_path, monkeypatch):
+    (tmp_path / "made_up_code.py").write_text("ONE = 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    import_module("made_up_code")
+    roots, compiled, fingerprint = (tmp_path,), [], drift_module.fingerprint
+    monkeypatch.setattr(drift_module, "fingerprint", lambda path: compiled.append(path.name) or fingerprint(path))
+    record = {"code": loaded_code(roots), "sources": loaded_sources(roots), "packages": {},
+              "python": platform.python_version()}
+    monkeypatch.delitem(sys.modules, "made_up_code")
+
+    def remarks(**changed):
+        (tmp_path / "provenance.json").write_text(json.dumps(record | changed))
+        for known in (drift_module._fingerprint_of, drift_module._source_of):
+            known.cache_clear()
+        return drift(tmp_path, roots)
+
+    assert remarks() == [] and not compiled
+    assert remarks(sources={}) == [] and remarks(sources={"made_up_code.py": "0"}) == []
+    assert remarks(sources=["made_up_code.py"]) == [] and len(compiled) == 3
+    assert len(remarks(python="3.0.0", code={"made_up_code.py": "that Python's"})) == 2
+    (tmp_path / "made_up_code.py").write_text("ONE = 2\n")
+    assert remarks() == ["code has changed: made_up_code.py"]
+    (tmp_path / "made_up_code.py").unlink()
+    assert remarks() == remarks(sources={"made_up_code.py": ""}) == ["code has changed: made_up_code.py"]
 
 
 def test_run_says_what_it_keeps_although_the_code_changed_and_renews_it(case):
