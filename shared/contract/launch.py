@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 
 from shared.contract.cli import answer_current, parse_request, report_input_error
-from shared.contract.interpreter import settle
+from shared.contract.interpreter import leave, settle
 from shared.contract.limits import hold_to_limits
 from shared.contract.pipeline import REPOSITORY
 from shared.contract.source import read_declaration
@@ -52,7 +52,7 @@ def earlier_verdict(events: Path | None) -> int | None:
 
 
 def main() -> int:
-    """0 where the stage is current, 2 where the input is at fault; otherwise the stage ends the process as a rule."""
+    """0 where the stage is current, 2 where the input is at fault; otherwise what the stage says."""
     tie_to_parent()
     folder, package, name, *arguments = sys.argv[1:]
     stage = read_declaration(Path(folder).joinpath(*package.split("."), f"{name}.py"))
@@ -75,9 +75,14 @@ def main() -> int:
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [*search, os.environ.get("PYTHONPATH", "")]))
     sys.path[:0] = search
     sys.argv[1:] = arguments
-    runpy.run_module(f"{package}.{name}", run_name="__main__", alter_sys=True)
+    try:
+        runpy.run_module(f"{package}.{name}", run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        if not isinstance(end.code, int):
+            raise
+        return end.code
     return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    leave(main())

@@ -90,7 +90,7 @@ def own_mb(process: psutil.Process) -> list[float]:
     try:
         for member in [process, *process.children(recursive=True)]:
             words = member.cmdline()
-            if "tools.limn" in words or "snakemake" in words:
+            if "tools.limn" in words or "tools.cli.snakemake_process" in words:
                 found.append(member.memory_info().rss / 2**20)
     except psutil.Error:
         pass

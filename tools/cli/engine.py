@@ -14,7 +14,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -135,9 +134,8 @@ def run_engine(home: Path, settings: EngineSettings, watch: Watch, log: Path) ->
     process = _start(home, settings, log)
     pause = _POLL_S + len(watch.tracks) / _TRACKS_PER_S
     try:
-        while process.poll() is None:
+        while not _has_ended(process, pause):
             watch.poll()
-            time.sleep(pause)
         watch.poll()
         return True
     except KeyboardInterrupt:
@@ -150,10 +148,18 @@ def run_engine(home: Path, settings: EngineSettings, watch: Watch, log: Path) ->
         process.wait()
 
 
+def _has_ended(process: subprocess.Popen, wait_s: float) -> bool:
+    """Whether it has, or does within that time."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(wait_s)
+    return process.poll() is not None
+
+
 def _start(home: Path, settings: EngineSettings, log: Path) -> subprocess.Popen:
     """Snakemake, started in a process group of its own that dies with this process."""
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(Path(__file__).with_name("Snakefile")),
-               "--directory", str(home), "--configfile", str(home / "config.json"), "--keep-going", "--nolock",
+    command = [sys.executable, "-m", "tools.cli.snakemake_process",
+               "--snakefile", str(Path(__file__).with_name("Snakefile")), "--directory", str(home),
+               "--configfile", str(home / "config.json"), "--keep-going", "--nolock",
                "--rerun-incomplete", "--rerun-triggers", "mtime", "--nocolor"]
     if settings.cores:
         command += ["--cores", str(settings.cores)]
