@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from shared.capture.chart import COLUMNS, CORNERS, PATCHES, ROWS, reflectances
-from shared.imaging.image_sampling import CLIPPED_CODE
+from shared.imaging.color import CLIPPED_CODE
 
 DETECTION_PX = 1600
 """Long side of the picture that the detector sees; it needs patches of some 14 px."""

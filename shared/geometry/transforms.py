@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 WORLD_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
 """The world's axes (y up, z towards the camera) from the camera's (y down, z away from it)."""
@@ -19,12 +18,16 @@ WORLD_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
 
 def rotation_from_vector(rotation_vector: np.ndarray) -> np.ndarray:
     """[..., 3] axis times angle in radians -> [..., 3, 3] rotation matrices."""
+    from scipy.spatial.transform import Rotation
+
     vector = np.asarray(rotation_vector, np.float64)
     return Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix().reshape(vector.shape[:-1] + (3, 3))
 
 
 def vector_from_rotation(rotation: np.ndarray) -> np.ndarray:
     """[..., 3, 3] rotation matrices -> [..., 3] axis times angle in radians."""
+    from scipy.spatial.transform import Rotation
+
     matrix = np.asarray(rotation, np.float64)
     return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(matrix.shape[:-2] + (3,))
 

@@ -12,6 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 TRANSFERS = ("srgb", "bt709", "linear")
+CLIPPED_CODE, CRUSHED_CODE = 0.98, 0.012
+"""Shares of the largest code from and to which a pixel tells only that it was at least so bright, or at most."""
 
 XYZ_FROM_REC709 = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]

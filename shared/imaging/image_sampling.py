@@ -18,9 +18,8 @@ import scipy.sparse as sparse
 from shared.geometry.mesh import Mesh, face_normals, half_edges, vertex_normals
 from shared.geometry.raycast import RAY_START_MM, RayScene
 from shared.geometry.transforms import project
+from shared.imaging.color import CLIPPED_CODE, CRUSHED_CODE
 
-CLIPPED_CODE = 0.98
-CRUSHED_CODE = 0.012
 MINIMUM_VIEW_COSINE, MAXIMUM_LEAST_COSINE = 0.2, 0.5
 BALL_MM = 80.0
 """A head is as round as a ball of this radius where it curves away from the camera."""

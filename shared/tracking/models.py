@@ -4,14 +4,19 @@ Its `models.json` lists each file with SHA-256, source and licence; a file is re
 A stage that reads a model declares it: its hash is in the stage's manifest.
 """
 
+from __future__ import annotations
+
 import hashlib
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from shared.capture.landmarks import FaceNetworks
 from shared.contract.models import HEAD_MODEL_FILE, NETWORK_FILES, models_folder
 from shared.errors import InputError
 from shared.io.arrays import load_arrays, read_json
-from shared.tracking.head_model import HeadModel
+
+if TYPE_CHECKING:
+    from shared.tracking.head_model import HeadModel
 
 LIST_FILE = "models.json"
 _HINT = "run make setup"
@@ -29,6 +34,8 @@ def load_face_networks() -> FaceNetworks:
 
 def load_head_model() -> HeadModel:
     """The head model of set-up, at its coarsest level. InputError where missing or damaged."""
+    from shared.tracking.head_model import HeadModel  # with all that meshes need; the face networks do without
+
     return HeadModel.from_arrays(load_arrays(checked_path(HEAD_MODEL_FILE)))
 
 
