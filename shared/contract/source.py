@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import marshal
+import os
 import sys
 import sysconfig
 from collections.abc import Sequence
@@ -53,13 +54,14 @@ def loaded_files(roots: Sequence[Path]) -> dict[str, Path]:
     A module that fills templates names their folder, TEMPLATES: its files count as the module's own. This package and
     all that is installed are left out.
     """
-    modules = {Path(module.__file__): module for module in list(sys.modules.values())
-               if getattr(module, "__file__", None)}
-    ours = {path: module for path, module in modules.items() if any(path.is_relative_to(root) for root in roots)}
+    inside = tuple(f"{root}{os.sep}" for root in roots)
+    files = {file: module for module in list(sys.modules.values()) if (file := getattr(module, "__file__", None))}
+    ours = {Path(file): module for file, module in files.items()
+            if file.startswith(inside) and _INSTALLED.isdisjoint(file.split(os.sep))}
     folders = {vars(module)["TEMPLATES"] for module in ours.values() if "TEMPLATES" in vars(module)}
-    files = {*ours, *(path for folder in folders for path in Path(folder).iterdir())}
+    found = {*ours, *(path for folder in folders for path in Path(folder).iterdir())}
     names: dict[str, Path] = {}
-    for path in sorted(files):
+    for path in sorted(found):
         root = next((root for root in roots if path.is_relative_to(root)), None)
         if root is not None and path.suffix in CODE_SUFFIXES and not path.is_relative_to(_STANDARD_LIBRARY):
             names.setdefault(path.relative_to(root).as_posix(), path)
