@@ -20,7 +20,9 @@ SEED ?= $(shell date +%s)
 
 .PHONY: setup demo test test-all test-random test-files chart stress lint audit clean
 
+# Byte code beforehand, for those who may not write here and for containers: without it each stage compiles a hundred files.
 setup: $(STAMP)
+	$(BIN)/python -m compileall -q shared stages tools
 	$(BIN)/python -m tools.setup.host
 	$(BIN)/python -m tools.setup.models
 
