@@ -59,21 +59,42 @@ STAGE = Stage(
 )
 
 
-def read_landmarks(job: Job, frames) -> tuple[np.ndarray, np.ndarray]:
-    """All frames through the networks, or the given file -> landmarks [F, 468, 2] px and presence [F]."""
+def look_at_frames(job: Job, frames):
+    """Each frame read once -> landmarks [F, 468, 2] px and presence [F], by the networks or of the given file, and the
+    F grey frames that the pictures for tracking are made of."""
+    import threading
+
     from shared.tracking.given_tracking import read_given_landmarks
     from shared.tracking.models import load_face_networks
+    from shared.tracking.parallel import in_order
+    from shared.tracking.tracked_clip import GreyFrame
 
-    if job.subject.landmarks is not None:
-        points, given = read_given_landmarks(job.subject.landmarks, frames.frame_index, frames.crop)
-        return points, given.astype(float)
-    networks, previous = load_face_networks(), None
-    points, presence = np.zeros((frames.count, 468, 2)), np.zeros(frames.count)
-    for i in job.progress(range(frames.count), "landmarks"):
-        presence[i], previous = networks.find(eight_bit(frames.read_codes(i)), previous, job.params.min_confidence)
+    given, points, presence = job.subject.landmarks, np.zeros((frames.count, 468, 2)), np.zeros(frames.count)
+    if given is not None:
+        points, is_given = read_given_landmarks(given, frames.frame_index, frames.crop)
+        presence = is_given.astype(float)
+    local, least, greys, previous = threading.local(), job.params.min_confidence, [], None
+
+    def networks():
+        if not hasattr(local, "networks"):
+            local.networks = load_face_networks()
+        return local.networks
+
+    def look(i: int):
+        rgb = eight_bit(frames.read_codes(i))
+        found = networks().find_alone(rgb, least) if given is None else None
+        return GreyFrame.of(rgb, frames.read_mask(i) == 0), found
+
+    for i, (grey, found) in enumerate(in_order(look, job.progress(range(frames.count), "landmarks"))):
+        greys.append(grey)
+        if given is not None:
+            continue
+        if found is None:
+            found = networks().find(eight_bit(frames.read_codes(i)), previous, least)
+        presence[i], previous = found
         if previous is not None:
             points[i] = previous[:, :2]
-    return points, presence
+    return points, presence, greys
 
 
 def eight_bit(codes: np.ndarray) -> np.ndarray:
@@ -81,22 +102,19 @@ def eight_bit(codes: np.ndarray) -> np.ndarray:
     return codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8)
 
 
-def build_clip(job: Job, frames, used: np.ndarray, landmarks_px: np.ndarray, given_poses: np.ndarray | None):
-    """Contrast pictures and unusable pixels of the frames with a face. used [F] int: positions of those frames;
-    given_poses [F, 4, 4] mm or None."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    from shared.tracking.tracked_clip import TrackedClip, face_width, pictures_of
-    from shared.tracking.tracks import THREADS
+def build_clip(job: Job, frames, greys: list, used: np.ndarray, landmarks_px: np.ndarray, given_poses):
+    """Contrast pictures and unusable pixels of the frames with a face. greys: of all frames, which go as their pictures
+    come; used [F] int: positions of those frames; given_poses [F, 4, 4] mm or None."""
+    from shared.tracking.parallel import in_order
+    from shared.tracking.tracked_clip import TrackedClip, face_width
 
     width = face_width(landmarks_px[used])
 
     def pictures(i: int) -> tuple[np.ndarray, ...]:
-        return pictures_of(eight_bit(frames.read_codes(i)), frames.read_mask(i) == 0, width)
+        grey, greys[i] = greys[i], None
+        return *grey.contrast(width), grey.unusable
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        in_order = zip(job.progress(used, "contrast pictures"), pool.map(pictures, used), strict=True)
-        made = [picture for _, picture in in_order]
+    made = list(in_order(pictures, job.progress(used, "contrast pictures")))
     contrast, detail, unusable = (list(kind) for kind in zip(*made, strict=True))
     return TrackedClip(
         contrast,
@@ -235,7 +253,7 @@ def run(job: Job) -> None:
 
     use_baseline_opencv()
     frames, model = FrameSet.open(job.input("sample_frames")), load_head_model().subdivided()
-    landmarks_px, presence = read_landmarks(job, frames)
+    landmarks_px, presence, greys = look_at_frames(job, frames)
     given_poses = None
     if job.subject.poses is not None:
         given_poses, posed = read_given_poses(job.subject.poses, frames.frame_index)
@@ -249,7 +267,7 @@ def run(job: Job) -> None:
             expected="3 or more",
             hint="film one head, facing the camera at the start, 200 px wide or more",
         )
-    clip = build_clip(job, frames, used, landmarks_px, given_poses)
+    clip = build_clip(job, frames, greys, used, landmarks_px, given_poses)
     track = track_head(clip, model, read_settings(job, frames.focal_known), job.progress, job.note)
     publish(job, frames, model, used, landmarks_px, presence, track)
 

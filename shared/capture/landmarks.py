@@ -115,6 +115,18 @@ class FaceNetworks:
         certain, points = self.landmarks(rgb, faces[0]) if faces else (0.0, None)
         if certain < least_presence and previous is not None:
             certain, points = self.track(rgb, previous)
+        return self._settled(rgb, certain, points, least_presence)
+
+    def find_alone(self, rgb: np.ndarray, least_presence: float) -> tuple[float, np.ndarray | None] | None:
+        """What `find` says whatever the neighbouring frame was; None where that one has a say: several faces, or none
+        that is certain. rgb: uint8 [H, W, 3]; least_presence: in [0, 1]."""
+        faces = self.detect(rgb)
+        if len(faces) != 1:
+            return None
+        certain, points = self.landmarks(rgb, faces[0])
+        return None if certain < least_presence else self._settled(rgb, certain, points, least_presence)
+
+    def _settled(self, rgb, certain, points, least_presence) -> tuple[float, np.ndarray | None]:
         for _ in range(SETTLING_CROPS if certain >= least_presence else 0):
             certain, points = self.track(rgb, points)
         return (certain, points) if certain >= least_presence else (certain, None)

@@ -1,14 +1,12 @@
 """Rigid bundle adjustment: the head as a rigid cloud of points, the camera moving around it.
 
 Poses and points are solved together. The scale and place of the cloud are free in the images: a weak prior on the
-points fixes them and steadies clips with little rotation. A Levenberg step over 250 frames and 2500 points takes about
-a second on two cores, where Ceres takes ten times as long over the same dense system, and its matrix gives the
+points fixes them and steadies clips with little rotation. A Levenberg step over 250 frames and 2500 points takes half
+a second on two cores, where Ceres takes twenty times as long over the same dense system, and its matrix gives the
 covariance.
 
-Every Jacobian passes through the point in camera axes, so that an observation is worth one 3 x 3 matrix J^T W J and one
-3-vector; the blocks of cameras, points and their coupling follow from these by rotations and levers. Every point is
-seen in most frames, so the reduced camera system is dense, and one matrix product builds it. Inside, components come
-first, [3, 3, F, n]: products of small matrices then run along frames and points, ten times faster than one by one.
+Compiled loops make the blocks of cameras, of points and of their coupling, each observation from its derivatives. Every
+point is seen in most frames, so the reduced camera system is dense, and one matrix product builds it.
 
 References: [Triggs2000], sections 3.3 (robust cost), 6.1 (elimination), 9 (gauge freedom); [Levenberg1944] (damped
 steps).
@@ -16,15 +14,19 @@ steps).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from shared.geometry.transforms import project, rotation_from_vector
+from shared.tracking.bundle_loops import Observations, add_normal_equations, cauchy_cost, couple
 from shared.tracking.motion_prior import MotionPrior
+from shared.tracking.parallel import shared_out
 
-CHUNK_POINTS = 256
+CHUNK_POINTS, TILE_ROWS = 256, 300
+"""Shares of the work that do not hang on the number of threads, so that sums do not either."""
 LARGEST_DAMPING = 1e6
 LEAST_GAIN = 1e-4
 """Relative fall of the cost at which the iteration ends; poses then move by less than 0.001 degrees."""
@@ -70,17 +72,16 @@ class BundleState:
 
 @dataclass(frozen=True)
 class Blocks:
-    """What some points add to the normal equations.
+    """Normal equations but for what couples cameras with points.
 
-    cameras [F, 6, 6], camera_rhs [F, 6]; points [n, 3, 3], point_rhs [n, 3]; mixed [6, 3, F, n]; the focal length's own
-    entries, with the cameras [F, 6] and with the points [n, 3].
+    cameras [F, 6, 6], camera_rhs [F, 6]; points [N, 3, 3], point_rhs [N, 3]; the focal length's own entries, with the
+    cameras [F, 6] and with the points [N, 3].
     """
 
     cameras: np.ndarray
     camera_rhs: np.ndarray
     points: np.ndarray
     point_rhs: np.ndarray
-    mixed: np.ndarray
     focal: float
     focal_rhs: float
     focal_cameras: np.ndarray
@@ -89,7 +90,10 @@ class Blocks:
 
 @dataclass(frozen=True)
 class ReducedSystem:
-    """matrix [C, C] @ cameras = rhs [C]; coupling [C, 3 N], half_inverse [N, 3, 3] and point_rhs [N, 3] for points."""
+    """matrix [C, C] @ cameras = rhs [C]; coupling [C, 3 N], half_inverse [N, 3, 3] and point_rhs [N, 3] for points.
+
+    coupling holds until the problem makes its next system.
+    """
 
     matrix: np.ndarray
     rhs: np.ndarray
@@ -118,109 +122,100 @@ class BundleProblem:
     ):
         """anchor [N, 3] mm; prior_mm: see shared.tracking.bundle.adjust; points seen less often than least_views are
         out."""
-        self.seen = tracks.seen & (tracks.seen.sum(0) >= least_views)
+        self.seen = np.ascontiguousarray(tracks.seen & (tracks.seen.sum(0) >= least_views))
         self.anchor, self.intrinsics, self.loss_scale = np.array(anchor, np.float64), intrinsics, loss_scale
         self.motion, self.refine_focal = motion, refine_focal
         self.unknowns = 6 * len(tracks.pixels) + int(refine_focal)
-        self._pixels = np.moveaxis(np.where(self.seen[..., None], tracks.pixels, 0.0), -1, 0).copy()
-        self._whitening = np.moveaxis(tracks.whitening, (2, 3), (0, 1)).copy()
+        self._pixels = np.ascontiguousarray(tracks.pixels, np.float64)
+        self._whitening = np.ascontiguousarray(tracks.whitening, np.float64)
         self._anchor_weight = np.maximum(self.seen.sum(0), 1) / prior_mm**2 + 1e-9
+        self._coupling: np.ndarray | None = None
 
-    def chunks(self):
-        """Slices over the points that bound the memory."""
-        return (slice(i, i + CHUNK_POINTS) for i in range(0, len(self.anchor), CHUNK_POINTS))
+    def _over_points(self, loop: Callable, state: BundleState) -> list:
+        """What loop(observations, first, last) returns for each chunk of the points."""
+        count = len(self.anchor)
+        observations = Observations(
+            rotation=np.ascontiguousarray(state.poses[:, :3, :3]),
+            shift=np.ascontiguousarray(state.poses[:, :3, 3]),
+            points=state.points,
+            pixels=self._pixels,
+            whitening=self._whitening,
+            seen=self.seen,
+            focal=self._focal(state),
+            centre=self.intrinsics[:2, 2].copy(),
+            loss=float(self.loss_scale),
+        )
+        return shared_out(
+            lambda first: loop(observations, first, min(first + CHUNK_POINTS, count)), range(0, count, CHUNK_POINTS)
+        )
 
     def cost(self, state: BundleState) -> float:
         """Cauchy cost of the residuals, the anchor's and the motion's."""
-        total = 0.0
-        for chunk in self.chunks():
-            weight = self._residuals(state, chunk)[1]
-            total -= self.loss_scale**2 * np.log(weight[self.seen[:, chunk]]).sum()
+        total = sum(self._over_points(cauchy_cost, state))
         total += (self._anchor_weight[:, None] * (state.points - self.anchor) ** 2).sum()
         return float(total + (0.0 if self.motion is None else self.motion.cost(state.poses)))
-
-    def _residuals(self, state, chunk) -> tuple[np.ndarray, ...]:
-        """Whitened residuals [2, F, n], Cauchy weights [F, n], points turned into camera axes, and in the camera."""
-        turned = state.poses[:, :3, :3].transpose(1, 0, 2) @ state.points[chunk].T
-        in_camera = turned + state.poses[:, :3, 3].T[..., None]
-        error = in_camera[:2] / in_camera[2] * self._focal(state)[:, None, None] + self.intrinsics[:2, 2, None, None]
-        error -= self._pixels[..., chunk]
-        whitening = self._whitening[..., chunk]
-        residual = whitening[:, 0] * error[0] + whitening[:, 1] * error[1]
-        squared = (residual**2).sum(0) / self.loss_scale**2
-        return residual, np.where(self.seen[:, chunk], 1.0 / (1.0 + squared), 0.0), turned, in_camera
 
     def _focal(self, state) -> np.ndarray:
         return self.intrinsics[[0, 1], [0, 1]] * np.exp(state.log_focal)
 
-    def linearised(self, state: BundleState, chunk: slice) -> Blocks:
-        """Normal equations of the points in one chunk."""
-        residual, weight, turned, in_camera = self._residuals(state, chunk)
-        x, y, z = in_camera
-        focal, whitening = self._focal(state), self._whitening[..., chunk]
-        by_x, by_y = whitening[:, 0] * (focal[0] / z), whitening[:, 1] * (focal[1] / z)
-        jacobian = np.stack([by_x, by_y, -(by_x * (x / z) + by_y * (y / z))])
-        weighted = jacobian * weight
-        inner = np.einsum("aifn,bifn->abfn", weighted, jacobian)
-        pull = -np.einsum("aifn,ifn->afn", weighted, residual)
-        rotation = state.poses[:, :3, :3].transpose(1, 2, 0).copy()
-        lever_inner, by_point = _cross(turned, inner), np.einsum("abfn,bcf->acfn", inner, rotation)
-        cameras = np.empty((len(weight), 6, 6))
-        cameras[:, :3, :3] = _cross(turned, lever_inner.swapaxes(0, 1)).sum(-1).transpose(2, 1, 0)
-        cameras[:, :3, 3:] = lever_inner.sum(-1).transpose(2, 0, 1)
-        cameras[:, 3:, :3] = np.swapaxes(cameras[:, :3, 3:], 1, 2)
-        cameras[:, 3:, 3:] = inner.sum(-1).transpose(2, 0, 1)
-        points = np.einsum("baf,bcfn->nac", rotation, by_point)
-        points[:, [0, 1, 2], [0, 1, 2]] += self._anchor_weight[chunk, None]
-        point_rhs = np.einsum("baf,bfn->na", rotation, pull)
-        point_rhs -= self._anchor_weight[chunk, None] * (state.points[chunk] - self.anchor[chunk])
-        # a longer focal length moves a pixel as a point does that moves away from the axis
-        growing = np.einsum("abfn,bfn->afn", inner[:, :2], in_camera[:2])
+    def linearised(self, state: BundleState) -> Blocks:
+        """Normal equations of all observations and of the points' anchor."""
+        frames, count = self.seen.shape
+        own = np.zeros((count, 3, 5))
+
+        def add(observations: Observations, first: int, last: int) -> np.ndarray:
+            cameras = np.zeros((frames, 7, 8))
+            add_normal_equations(observations, first, last, cameras, own)
+            return cameras
+
+        cameras = sum(self._over_points(add, state))
+        normal = cameras[:, :6, :6] + np.triu(cameras[:, :6, :6], 1).swapaxes(1, 2)
+        own[:, [0, 1, 2], [0, 1, 2]] += self._anchor_weight[:, None]
         return Blocks(
-            cameras=cameras,
-            camera_rhs=np.concatenate([_cross(turned, pull).sum(-1), pull.sum(-1)]).T,
-            points=points,
-            point_rhs=point_rhs,
-            mixed=np.concatenate([_cross(turned, by_point), by_point]),
-            focal=float((growing[:2] * in_camera[:2]).sum()),
-            focal_rhs=float((pull[:2] * in_camera[:2]).sum()),
-            focal_cameras=np.concatenate([_cross(turned, growing).sum(-1), growing.sum(-1)]).T,
-            focal_points=np.einsum("baf,bfn->na", rotation, growing),
+            cameras=normal,
+            camera_rhs=cameras[:, :6, 7],
+            points=own[..., :3],
+            point_rhs=own[..., 4] - self._anchor_weight[:, None] * (state.points - self.anchor),
+            focal=float(cameras[:, 6, 6].sum()),
+            focal_rhs=float(cameras[:, 6, 7].sum()),
+            focal_cameras=cameras[:, :6, 6],
+            focal_points=own[..., 3],
         )
+
+    def coupling(self, state: BundleState, half: np.ndarray, focal_points: np.ndarray) -> np.ndarray:
+        """What couples the camera unknowns with the points, [C, 3 N], each point's columns times its half [N, 3, 3]; it
+        holds until the next call. focal_points [N, 3]: see Blocks."""
+        if self._coupling is None:  # the largest array of all: its pages are had once
+            self._coupling = np.empty((self.unknowns, 3 * len(half)))
+        coupling = self._coupling
+        self._over_points(
+            lambda observations, first, last: couple(observations, first, last, half, coupling), state
+        )
+        if self.refine_focal:
+            coupling[-1] = np.einsum("nj,njk->nk", focal_points, half).ravel()
+        return coupling
 
     def reduced_system(self, state: BundleState) -> ReducedSystem:
         """Gauss-Newton system of the cameras with the points eliminated (Schur complement)."""
-        frames, count = self.seen.shape
+        frames, block = len(self.seen), self.linearised(state)
         size = 6 * frames
-        matrix, rhs = np.zeros((self.unknowns,) * 2), np.zeros(self.unknowns)
-        coupling = np.empty((self.unknowns, 3 * count))
-        half_inverse, point_rhs = np.empty((count, 3, 3)), np.empty((count, 3))
-        cameras = np.zeros((frames, 6, 6))
-        for chunk in self.chunks():
-            block = self.linearised(state, chunk)
-            half = np.linalg.cholesky(np.linalg.inv(block.points))
-            columns = slice(3 * chunk.start, 3 * (chunk.start + len(half)))
-            mixed = np.einsum("abfn,bcn->acfn", block.mixed, half.transpose(1, 2, 0).copy())
-            coupling[:size, columns] = mixed.transpose(2, 0, 3, 1).reshape(size, -1)
-            half_inverse[chunk], point_rhs[chunk] = half, block.point_rhs
-            cameras += block.cameras
-            rhs[:size] += block.camera_rhs.ravel()
-            if self.refine_focal:
-                coupling[-1, columns] = np.einsum("nj,njk->nk", block.focal_points, half).ravel()
-                matrix[-1, :size] += block.focal_cameras.ravel()
-                matrix[-1, -1] += block.focal
-                rhs[-1] += block.focal_rhs
+        half = np.linalg.cholesky(np.linalg.inv(block.points))
+        coupling = self.coupling(state, half, block.focal_points)
+        matrix, rhs = -_outer_product(coupling), np.zeros(self.unknowns)
+        rhs[:size] = block.camera_rhs.ravel()
         if self.refine_focal:
-            matrix[:size, -1] = matrix[-1, :size]
+            matrix[-1, :size] += block.focal_cameras.ravel()
+            matrix[:size, -1] += block.focal_cameras.ravel()
+            matrix[-1, -1] += block.focal
+            rhs[-1] = block.focal_rhs
         for f in range(frames):
-            matrix[6 * f : 6 * f + 6, 6 * f : 6 * f + 6] = cameras[f]
-        matrix -= coupling @ coupling.T
-        rhs -= coupling @ np.einsum("njk,nj->nk", half_inverse, point_rhs).ravel()
+            matrix[6 * f : 6 * f + 6, 6 * f : 6 * f + 6] += block.cameras[f]
+        rhs -= coupling @ np.einsum("njk,nj->nk", half, block.point_rhs).ravel()
         if self.motion is not None:
             for axis, (normal, pull) in enumerate(zip(*self.motion.normal_equations(state.poses), strict=True)):
                 matrix[axis:size:6, axis:size:6] += normal
                 rhs[axis:size:6] += pull
-        return ReducedSystem(matrix, rhs, coupling, half_inverse, point_rhs)
+        return ReducedSystem(matrix, rhs, coupling, half, block.point_rhs)
 
     def step(self, state: BundleState, system: ReducedSystem, damping: float) -> BundleState:
         """Solves the damped camera system, then each point for itself. damping: relative to the diagonal."""
@@ -242,10 +237,18 @@ def moved(poses: np.ndarray, motion: np.ndarray) -> np.ndarray:
     return result
 
 
-def _cross(vectors: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Cross products of vectors [3, F, n] with others [3, F, n], or with each column of matrices [3, C, F, n]."""
-    (x, y, z), (a, b, c) = vectors, others
-    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a])
+def _outer_product(rows: np.ndarray) -> np.ndarray:
+    """rows [C, K] @ rows.T, tile by tile: the library itself works on one thread."""
+    product = np.empty((len(rows), len(rows)))
+    starts = range(0, len(rows), TILE_ROWS)
+
+    def fill(tile: tuple[int, int]) -> None:
+        i, j = (slice(start, start + TILE_ROWS) for start in tile)
+        product[i, j] = rows[i] @ rows[j].T
+        product[j, i] = product[i, j].T
+
+    shared_out(fill, [(i, j) for i in starts for j in starts if i <= j])
+    return product
 
 
 @dataclass(frozen=True)
@@ -341,11 +344,8 @@ def resect(
     poses = np.array(camera_from_points, np.float64)
     solvable = tracks.seen.sum(1) >= 6
     for _ in range(iterations):
-        cameras, rhs = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6))
-        for chunk in problem.chunks():
-            block = problem.linearised(BundleState(poses, problem.anchor), chunk)
-            cameras += block.cameras
-            rhs += block.camera_rhs
+        block = problem.linearised(BundleState(poses, problem.anchor))
+        cameras, rhs = block.cameras, block.camera_rhs
         cameras[~solvable] = np.eye(6)
         step = np.where(solvable[:, None], np.linalg.solve(cameras, rhs[..., None])[..., 0], 0.0)
         poses = moved(poses, step)
@@ -371,9 +371,8 @@ def place_points(
     problem = BundleProblem(tracks, points, intrinsics, loss_scale=loss_scale, prior_mm=prior_mm)
     state = BundleState(np.array(camera_from_points, np.float64), problem.anchor.copy())
     for _ in range(iterations):
-        for chunk in problem.chunks():
-            block = problem.linearised(state, chunk)
-            state.points[chunk] += np.linalg.solve(block.points, block.point_rhs[..., None])[..., 0]
+        block = problem.linearised(state)
+        state.points[:] += np.linalg.solve(block.points, block.point_rhs[..., None])[..., 0]
     pixels, _ = project(state.points, state.poses, intrinsics)
     return BundleSolution(state.poses, state.points, pixels - tracks.pixels)
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -23,9 +22,10 @@ from shared.tracking.first_poses import (
     trackable_faces,
 )
 from shared.tracking.head_model import HeadModel
+from shared.tracking.parallel import in_order
 from shared.tracking.texture_tracks import MeanContrast, Windows, mean_texture, track_frame
 from shared.tracking.tracked_clip import TrackedClip
-from shared.tracking.tracks import THREADS, visible_vertices
+from shared.tracking.tracks import visible_vertices
 
 LEAST_COSINE = 0.25
 """Skin seen more obliquely is not tracked."""
@@ -95,7 +95,7 @@ class AtlasTracker:
             image, shown = placed[frame]
             return image.astype(np.float32), shown.astype(np.float32)
 
-        return mean_texture(lambda: _in_order(picture, progress(frames, "mean texture")))
+        return mean_texture(lambda: in_order(picture, progress(frames, "mean texture")))
 
     def track(self, texture: MeanContrast, frames: np.ndarray, poses: np.ndarray, progress: Callable) -> Tracks:
         """Tracks of all frames [F]; those that are not among the chosen [K] see nothing."""
@@ -110,21 +110,9 @@ class AtlasTracker:
             return found * self._shrink, whitening / self._shrink
 
         label = "fine tracks" if self._settings.detail else "tracks"
-        for frame, found in zip(frames, _in_order(observe, progress(frames, label)), strict=True):
+        for frame, found in zip(frames, in_order(observe, progress(frames, label)), strict=True):
             pixels[frame], whitening[frame] = found
         return Tracks(pixels, whitening)
-
-
-def _in_order(work: Callable, items) -> Iterator:
-    """work(item) for each, a few at once, in order; OpenCV and numpy let go of the interpreter."""
-    with ThreadPoolExecutor(THREADS) as pool:
-        waiting = []
-        for item in items:
-            waiting.append(pool.submit(work, int(item)))
-            if len(waiting) > 2 * THREADS:
-                yield waiting.pop(0).result()
-        for future in waiting:
-            yield future.result()
 
 
 def track_texture(

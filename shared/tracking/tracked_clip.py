@@ -59,10 +59,21 @@ def face_width(landmarks_px: np.ndarray) -> float:
     return float(np.median(np.ptp(landmarks_px[..., 0], axis=1)))
 
 
-def pictures_of(rgb: np.ndarray, background: np.ndarray, face_width_px: float) -> tuple[np.ndarray, ...]:
-    """[H, W, 3] uint8 and background [H, W] bool -> contrast, detail and unusable, [H, W] uint8 each."""
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    sigma = float(np.clip(face_width_px / 55.0, 2.5, 12.0))
-    contrast = local_contrast(grey, sigma, 1.5 * sigma, 0.02)
-    detail = local_contrast(grey, DETAIL_SIGMA_PX, 2.25 * DETAIL_SIGMA_PX, 0.05)
-    return contrast, detail, unusable_pixels(rgb) | background.astype(np.uint8)
+@dataclass(frozen=True)
+class GreyFrame:
+    """What the pictures of a frame are made of: grey [H, W] uint8, and 1 where a pixel says nothing, [H, W] uint8."""
+
+    grey: np.ndarray
+    unusable: np.ndarray
+
+    @classmethod
+    def of(cls, rgb: np.ndarray, background: np.ndarray) -> GreyFrame:
+        """From [H, W, 3] uint8 and background [H, W] bool."""
+        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        return cls(grey, unusable_pixels(rgb) | background.astype(np.uint8))
+
+    def contrast(self, face_width_px: float) -> tuple[np.ndarray, np.ndarray]:
+        """The wide contrast of the skin and its finest detail, [H, W] uint8 each."""
+        sigma = float(np.clip(face_width_px / 55.0, 2.5, 12.0))
+        wide = local_contrast(self.grey, sigma, 1.5 * sigma, 0.02)
+        return wide, local_contrast(self.grey, DETAIL_SIGMA_PX, 2.25 * DETAIL_SIGMA_PX, 0.05)

@@ -9,8 +9,6 @@ References: [Kroeger2016] (dense inverse search); [Kalal2010] (the forward-backw
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -21,6 +19,7 @@ from shared.geometry.atlas import sample
 from shared.geometry.mesh import interpolate, normalised
 from shared.geometry.raycast import RayScene, camera_hits
 from shared.geometry.transforms import camera_centres
+from shared.tracking.parallel import in_order
 
 CRUSHED_CODE, CLIPPED_CODE = 8, 250
 """8-bit code values at and beyond which a pixel says nothing of the skin's texture."""
@@ -39,12 +38,11 @@ def local_contrast(grey: np.ndarray, sigma_px: float, spread_px: float, floor: f
 
 def unusable_pixels(rgb: np.ndarray) -> np.ndarray:
     """[H, W, 3] uint8 -> [H, W] uint8, 1 where a channel is clipped or all are crushed, grown by two pixels."""
-    bad = (rgb.max(-1) >= CLIPPED_CODE) | (rgb.max(-1) <= CRUSHED_CODE)
+    red, green, blue = cv2.split(rgb)
+    brightest = cv2.max(cv2.max(red, green), blue)
+    bad = (brightest >= CLIPPED_CODE) | (brightest <= CRUSHED_CODE)
     return cv2.dilate(bad.astype(np.uint8), np.ones((5, 5), np.uint8))
 
-
-THREADS = len(os.sched_getaffinity(0))
-"""Frames tracked at once: OpenCV lets go of the interpreter, and its own threads gain little on pictures this small."""
 
 LEAST_SHOWN = 20
 """A frame that shows fewer of the grid's points is not tracked."""
@@ -153,9 +151,8 @@ def dense_tracks(
         shown = grid.valid & (grid.warp(visible[i].astype(np.float32)[:, None])[..., 0] > 0.99)
         return _track_frame(grid, target, contrast[i], unusable[i], grid.warp(positions_px[i]), shown, place)
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        for i, found in zip(progress(range(len(contrast))), pool.map(track, range(len(contrast))), strict=True):
-            tracks[i] = found
+    for i, found in enumerate(in_order(track, progress(range(len(contrast))))):
+        tracks[i] = found
     return tracks, np.stack([rows, columns], axis=1)
 
 
