@@ -73,7 +73,7 @@ def run(job: Job) -> None:
     job.note(selection.summary)
     intrinsics, focal_known, focal_warning = source_intrinsics(
         info, subject.focal_length_px, subject.focal_length_mm, subject.sensor_width_mm)
-    records, picture_warnings = write_frames(reader, selection, networks, chart, job)
+    records, picture_warnings = write_frames(reader, selection, chart, job)
     warnings = [*info.warnings, *transfer_warnings(info.transfer_tag, subject.transfer), *selection.warnings,
                 *picture_warnings, *chart.warnings(), *[focal_warning] * (not focal_known)]
     write_json(job.out / "frames.json", {
@@ -120,14 +120,16 @@ def watch_for_chart(reader, subject: Subject):
     return chart
 
 
-def write_frames(reader, selection, networks, chart, job: Job) -> tuple[list[dict], list[str]]:
+def write_frames(reader, selection, chart, job: Job) -> tuple[list[dict], list[str]]:
     """The second pass: crops, masks and the contact sheet -> one record per frame, and warnings."""
     from shared.capture.crop_pixels import area_average, clipped_share, display_codes, frame_mask, is_grey
     from shared.capture.framing import face_height
-    from shared.compute.read_ahead import read_ahead, write_behind
+    from shared.compute.parallel import in_order
+    from shared.compute.read_ahead import read_ahead
     from shared.imaging.picture_detail import ClipDetail
     from shared.io.images import write_png
     from shared.report.contact_sheet import ContactSheet
+    from shared.tracking.models import own_face_networks
 
     for folder in ("frames", "masks"):
         (job.out / folder).mkdir(parents=True, exist_ok=True)
@@ -135,28 +137,30 @@ def write_frames(reader, selection, networks, chart, job: Job) -> tuple[list[dic
     sheet, records, clipped, grey, detail = ContactSheet(count), [], [], [], ClipDetail(count)
     chart.expect(count)
 
-    def cut_out(frame):
+    def cut_out(i: int, frame):
         whole = frame.codes()
-        part = whole[crop.y0:crop.y0 + crop.height, crop.x0:crop.x0 + crop.width]
-        codes = area_average(part, crop.size, transfer)
-        return frame, whole, codes, display_codes(codes, transfer)
+        chart.look(i, frame.index, whole)
+        part = whole[crop.y0:crop.y0 + crop.height, crop.x0:crop.x0 + crop.width].copy()
+        points = (selection.landmarks[i][:, :2] - (crop.x0, crop.y0)) * crop.scale
+        return i, part, points, frame_record(frame.index, frame.time_s, points, selection.sharpness[i])
 
-    def save(record, codes, mask):
+    def finish(cut):
+        i, part, points, record = cut
+        codes = area_average(part, crop.size, transfer)
+        rgb = display_codes(codes, transfer)
+        mask = frame_mask(rgb, own_face_networks().person_mask(rgb), points)
         write_png(job.out / record["file"], codes)
         write_png(job.out / record["mask"], mask)
+        detail.look(i, rgb, mask == FACE, face_height(points))
+        return record, rgb, mask, clipped_share(codes, mask), is_grey(codes)
 
-    frames = read_ahead(map(cut_out, reader.frames(selection.frame_index)))
-    with write_behind() as write:
-        for i, (frame, whole, codes, rgb) in enumerate(job.progress(frames, "cropping", total=count)):
-            chart.look(i, frame.index, whole)
-            points = (selection.landmarks[i][:, :2] - (crop.x0, crop.y0)) * crop.scale
-            mask = frame_mask(rgb, networks.person_mask(rgb), points)
-            records.append(frame_record(frame.index, frame.time_s, points, selection.sharpness[i]))
-            write(save, records[-1], codes, mask)
-            clipped.append(clipped_share(codes, mask))
-            grey.append(is_grey(codes))
-            detail.look(i, rgb, mask == FACE, face_height(points))
-            sheet.add(rgb, mask)
+    cuts = read_ahead(map(cut_out, range(count), reader.frames(selection.frame_index)))
+    finished = job.progress(in_order(finish, cuts), "cropping", total=count)
+    for record, rgb, mask, clipped_of_frame, is_frame_grey in finished:
+        records.append(record)
+        clipped.append(clipped_of_frame)
+        grey.append(is_frame_grey)
+        sheet.add(rgb, mask)
     write_png(job.out / "contact_sheet.png", sheet.picture())
     if chart.picture is not None:
         write_png(job.out / "chart.png", chart.picture)
@@ -185,7 +189,7 @@ def frame_record(frame_index: int, time_s: float, points: np.ndarray, sharpness:
 def check(job: Job) -> None:
     """Frames in order and of one size, the crop inside the source, its camera consistent, a face in every mask."""
     from shared.capture.framing import Crop
-    from shared.compute.read_ahead import read_ahead
+    from shared.compute.parallel import in_order
     from shared.io.arrays import read_json
     from shared.io.frames import FrameSet
 
@@ -200,16 +204,16 @@ def check(job: Job) -> None:
     require(bool(np.all(np.diff(frames.time_s) > 0)), "times do not rise")
     corner = frames.intrinsics @ np.linalg.inv(frames.intrinsics_source) @ (crop.x0, crop.y0, 1.0)
     require(np.allclose(corner, (0, 0, 1), atol=1e-6), "the crop's intrinsics do not belong to the crop")
-    pictures = read_ahead((frames.read_codes(i), frames.read_mask(i)) for i in range(frames.count))
-    for i, (codes, mask) in enumerate(pictures):
-        check_frame(frames, i, codes, mask)
+    for _ in in_order(lambda i: check_frame(frames, i), range(frames.count)):
+        pass
 
 
-def check_frame(frames, i: int, codes: np.ndarray, mask: np.ndarray) -> None:
-    """Sizes, mask values, and a face that is not of one colour. mask [H, W] uint8."""
-    size = frames.size[::-1]
+def check_frame(frames, i: int) -> None:
+    """Sizes, mask values, and a face that is not of one colour."""
+    codes, mask, size = frames.read_codes(i), frames.read_mask(i), frames.size[::-1]
     require(codes.shape == (*size, 3) and mask.shape == size, f"{frames.files[i]}: wrong size")
-    require(set(np.unique(mask).tolist()) <= {0, 128, FACE}, f"{frames.mask_files[i]}: values besides 0, 128, 255")
+    known = np.isin(np.nonzero(np.bincount(mask.ravel(), minlength=256))[0], (0, 128, FACE))
+    require(bool(known.all()), f"{frames.mask_files[i]}: values besides 0, 128, 255")
     require(bool((mask == FACE).any()), f"{frames.mask_files[i]}: no face")
     require(int(np.ptp(codes[mask == FACE])) > 0, f"{frames.files[i]}: the face is of one colour")
 

@@ -62,27 +62,20 @@ STAGE = Stage(
 def look_at_frames(job: Job, frames):
     """Each frame read once -> landmarks [F, 468, 2] px and presence [F], by the networks or of the given file, and the
     F grey frames that the pictures for tracking are made of."""
-    import threading
-
+    from shared.compute.parallel import in_order
     from shared.tracking.given_tracking import read_given_landmarks
-    from shared.tracking.models import load_face_networks
-    from shared.tracking.parallel import in_order
+    from shared.tracking.models import own_face_networks
     from shared.tracking.tracked_clip import GreyFrame
 
     given, points, presence = job.subject.landmarks, np.zeros((frames.count, 468, 2)), np.zeros(frames.count)
     if given is not None:
         points, is_given = read_given_landmarks(given, frames.frame_index, frames.crop)
         presence = is_given.astype(float)
-    local, least, greys, previous = threading.local(), job.params.min_confidence, [], None
-
-    def networks():
-        if not hasattr(local, "networks"):
-            local.networks = load_face_networks()
-        return local.networks
+    least, greys, previous = job.params.min_confidence, [], None
 
     def look(i: int):
         rgb = eight_bit(frames.read_codes(i))
-        found = networks().find_alone(rgb, least) if given is None else None
+        found = own_face_networks().find_alone(rgb, least) if given is None else None
         return GreyFrame.of(rgb, frames.read_mask(i) == 0), found
 
     for i, (grey, found) in enumerate(in_order(look, job.progress(range(frames.count), "landmarks"))):
@@ -90,7 +83,7 @@ def look_at_frames(job: Job, frames):
         if given is not None:
             continue
         if found is None:
-            found = networks().find(eight_bit(frames.read_codes(i)), previous, least)
+            found = own_face_networks().find(eight_bit(frames.read_codes(i)), previous, least)
         presence[i], previous = found
         if previous is not None:
             points[i] = previous[:, :2]
@@ -105,7 +98,7 @@ def eight_bit(codes: np.ndarray) -> np.ndarray:
 def build_clip(job: Job, frames, greys: list, used: np.ndarray, landmarks_px: np.ndarray, given_poses):
     """Contrast pictures and unusable pixels of the frames with a face. greys: of all frames, which go as their pictures
     come; used [F] int: positions of those frames; given_poses [F, 4, 4] mm or None."""
-    from shared.tracking.parallel import in_order
+    from shared.compute.parallel import in_order
     from shared.tracking.tracked_clip import TrackedClip, face_width
 
     width = face_width(landmarks_px[used])

@@ -51,7 +51,7 @@ def frame_mask(rgb: np.ndarray, person: np.ndarray, points: np.ndarray) -> np.nd
     own = _person_of(rgb, person, landmark_box(points))
     if not own.any():
         return oval * np.uint8(FACE)
-    return np.where(own & (oval > 0), FACE, np.where(own, PERSON, BACKGROUND)).astype(np.uint8)
+    return np.where(own & (oval > 0), np.uint8(FACE), np.where(own, np.uint8(PERSON), np.uint8(BACKGROUND)))
 
 
 def _person_of(rgb: np.ndarray, person: np.ndarray, box: np.ndarray) -> np.ndarray:
@@ -69,8 +69,11 @@ def _person_of(rgb: np.ndarray, person: np.ndarray, box: np.ndarray) -> np.ndarr
 
 def clipped_share(codes: np.ndarray, mask: np.ndarray) -> float:
     """Share of the face's pixels with a channel at its maximum. codes [H, W, 3], mask [H, W] as of frame_mask."""
-    face = codes[mask == FACE]
-    return float((face.max(axis=1) >= np.iinfo(codes.dtype).max).mean()) if len(face) else 0.0
+    face = mask == FACE
+    if not face.any():
+        return 0.0
+    red, green, blue = cv2.split(codes)
+    return float((cv2.max(cv2.max(red, green), blue)[face] == np.iinfo(codes.dtype).max).mean())
 
 
 def is_grey(codes: np.ndarray) -> bool:

@@ -1,6 +1,6 @@
 """How the processor is used: compiled loops, threads, reading ahead, and what makes results the same on
 all processors.
 
-Read in this order: kept_code, compiled, processor, threads, run_context, read_ahead, robust, sparse_solve.
+Read in this order: kept_code, compiled, processor, threads, parallel, run_context, read_ahead, robust, sparse_solve.
 May import: nothing.
 """

@@ -20,10 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from shared.compute.parallel import shared_out
 from shared.geometry.transforms import project, rotation_from_vector
 from shared.tracking.bundle_loops import Observations, add_normal_equations, cauchy_cost, couple
 from shared.tracking.motion_prior import MotionPrior
-from shared.tracking.parallel import shared_out
 
 CHUNK_POINTS, TILE_ROWS = 256, 300
 """Shares of the work that do not hang on the number of threads, so that sums do not either."""

@@ -7,6 +7,7 @@ A stage that reads a model declares it: its hash is in the stage's manifest.
 from __future__ import annotations
 
 import hashlib
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,6 +31,16 @@ def network_path(name: str) -> Path:
 def load_face_networks() -> FaceNetworks:
     """The three networks, ready to run."""
     return FaceNetworks(*(network_path(name) for name in ("face_detector", "face_landmarks", "person_mask")))
+
+
+_of_thread = threading.local()
+
+
+def own_face_networks() -> FaceNetworks:
+    """The networks of the calling thread, loaded at its first call: each runs one picture at a time."""
+    if not hasattr(_of_thread, "networks"):
+        _of_thread.networks = load_face_networks()
+    return _of_thread.networks
 
 
 def load_head_model() -> HeadModel:

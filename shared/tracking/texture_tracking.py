@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from shared.compute.parallel import in_order
 from shared.compute.robust import ROBUST_SCALE
 from shared.geometry.atlas import Atlas, PlacedFrame, build_atlas, place_frame, sample
 from shared.geometry.mesh import Mesh, vertex_normals
@@ -22,7 +23,6 @@ from shared.tracking.first_poses import (
     trackable_faces,
 )
 from shared.tracking.head_model import HeadModel
-from shared.tracking.parallel import in_order
 from shared.tracking.texture_tracks import MeanContrast, Windows, mean_texture, track_frame
 from shared.tracking.tracked_clip import TrackedClip
 from shared.tracking.tracks import visible_vertices

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 from scipy.spatial import Delaunay
 
+from shared.compute.parallel import in_order
 from shared.geometry.atlas import sample
 from shared.geometry.mesh import interpolate, normalised
 from shared.geometry.raycast import RayScene, camera_hits
 from shared.geometry.transforms import camera_centres
-from shared.tracking.parallel import in_order
 
 CRUSHED_CODE, CLIPPED_CODE = 8, 250
 """8-bit code values at and beyond which a pixel says nothing of the skin's texture."""

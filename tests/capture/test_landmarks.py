@@ -140,6 +140,17 @@ class TestNetworks:
         found = networks.detect(np.concatenate([picture, picture[:, ::-1]], axis=1))
         assert len(found) == 2 and abs(found[0].box[0] - found[1].box[0]) > RENDER_SIZE / 2
 
+    def test_one_face_is_found_without_its_neighbours_and_two_are_not(self, networks, portrait):
+        picture, _ = portrait
+        presence, points = networks.find_alone(picture, 0.5)
+        for previous in (None, points + 20.0):
+            expected_presence, expected = networks.find(picture, previous, 0.5)
+            assert presence == pytest.approx(expected_presence, abs=1e-4)
+            assert np.allclose(points, expected, atol=1e-3)
+        assert networks.find_alone(np.concatenate([picture, picture[:, ::-1]], axis=1), 0.5) is None
+        assert networks.find_alone(np.full_like(picture, 90), 0.5) is None
+        assert networks.find_alone(picture, 1.1) is None
+
     def test_nothing_is_found_where_nothing_is(self, networks):
         noise = np.random.default_rng(3).integers(0, 256, (240, 320, 3), dtype=np.uint8)
         assert networks.detect(noise) == [] and networks.detect(np.full_like(noise, 90)) == []

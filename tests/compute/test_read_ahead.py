@@ -1,10 +1,10 @@
-"""Items loaded, and written, on a second thread while the caller works."""
+"""Items loaded on a second thread while the caller works."""
 
 import threading
 
 import pytest
 
-from shared.compute.read_ahead import read_ahead, write_behind
+from shared.compute.read_ahead import read_ahead
 
 
 def test_results_come_in_order_and_loading_runs_ahead():
@@ -38,30 +38,3 @@ def test_a_fault_is_raised_at_its_turn():
     assert next(results) == 0.5
     with pytest.raises(ZeroDivisionError):
         next(results)
-
-
-def test_calls_are_made_in_order_beside_the_caller():
-    made, go_on = [], threading.Event()
-
-    def call(item):
-        assert go_on.wait(timeout=300.0)
-        made.append(item)
-
-    with write_behind() as write:
-        write(call, 0)
-        assert made == []  # the caller is here while the call waits
-        go_on.set()
-        for item in range(1, 5):
-            write(call, item)
-            assert len(made) >= item  # one is on its way at most
-    assert made == [0, 1, 2, 3, 4]
-
-
-@pytest.mark.parametrize("after", [0, 1])
-def test_what_a_call_raises_reaches_the_caller(after):
-    made = []
-    with pytest.raises(ZeroDivisionError), write_behind() as write:
-        write(lambda: 1 / 0)
-        for _ in range(after):
-            write(made.append, 1)
-    assert made == []
