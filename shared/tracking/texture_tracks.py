@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -31,6 +32,8 @@ OUTLIER_SPREADS = 1.5
 LEAST_SPREAD = 1.0
 """Code values: the pictures are quantised."""
 
+LOOKUP_ROW = 256
+
 
 @dataclass(frozen=True)
 class MeanContrast:
@@ -39,6 +42,12 @@ class MeanContrast:
     mean: np.ndarray
     spread: np.ndarray
     seen: np.ndarray
+
+    @cached_property
+    def gradient(self) -> tuple[np.ndarray, np.ndarray]:
+        """Central differences [h, w] along columns and rows."""
+        kernel = np.array([[-0.5, 0.0, 0.5]], np.float32)
+        return cv2.filter2D(self.mean, cv2.CV_32F, kernel), cv2.filter2D(self.mean, cv2.CV_32F, kernel.T)
 
 
 def mean_texture(frames: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]) -> MeanContrast:
@@ -79,82 +88,112 @@ def track_frame(
     -> positions [N, 2] px (NaN: not found) and whitening [N, 2, 2] 1/px: whitening @ error has unit covariance where
     the window's pixels differ from the mean by independent noise.
     """
-    gradient = _gradient(texture.mean)
-    known = placed.shown * (texture.seen > 0)
-    rows, columns = np.mgrid[0 : known.shape[0], 0 : known.shape[1]].astype(np.float32)
-    offset = np.zeros((*known.shape, 2), np.float32)
+    known = (placed.shown > 0) & (texture.seen > 0)
+    texels = np.flatnonzero(known)
+    known[atlas.rows, atlas.columns] = True
+    moving = np.flatnonzero(known)
+    lookups = _Lookups(texels, placed.shown.shape[1])
+    mean, spread = texture.mean.ravel().take(texels), texture.spread.ravel().take(texels)
+    gx, gy = (part.ravel().take(texels) for part in texture.gradient)
+    offset = np.zeros((*placed.shown.shape, 2), np.float32)
+    windowed, offsets = _Windowed(placed.shown.shape, texels, windows), offset.reshape(-1, 2)
     for step in range(windows.steps):
-        layout = placed.layout if step == 0 else _shifted(placed.layout, columns, rows, offset)
-        difference = sample(picture, layout, cv2.INTER_CUBIC).astype(np.float32) - texture.mean
-        weight = cauchy_weight(difference, OUTLIER_SPREADS * texture.spread, known)
-        sums = _window_sums(gradient, difference, known, weight, windows.sigma)
-        offset -= sums.offset()
-        np.clip(offset, -2.0 * windows.search, 2.0 * windows.search, out=offset)
-    return _observations(atlas, placed, offset, sums, windows)
+        image = lookups.sample(picture, placed.layout, offset if step else None)
+        difference = image.astype(np.float32) - mean
+        weight = cauchy_weight(difference, OUTLIER_SPREADS * spread)
+        wx, wy = weight * gx, weight * gy
+        normal = windowed.means(wx * gx, wx * gy, wy * gy, wx * difference)
+        pull = windowed.means(wy * difference)
+        moved = offsets.take(moving, 0) - _solved(normal.reshape(-1, 4).take(moving, 0), pull.ravel().take(moving))
+        moved = np.clip(moved, -2.0 * windows.search, 2.0 * windows.search)
+        offsets[moving, 0], offsets[moving, 1] = moved.T
+    # outliers don't pull, but a window full of them says little: its variance counts them
+    others = windowed.means(weight, np.ones_like(weight), difference * difference)
+    at = atlas.rows, atlas.columns
+    return _observations(atlas, placed, offset[at], _WindowMeans(*normal[at].T[:3], *others[at].T), windows)
 
 
-def _shifted(layout: np.ndarray, columns: np.ndarray, rows: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    return cv2.remap(layout, columns + offset[..., 0], rows + offset[..., 1], cv2.INTER_LINEAR)
+class _Lookups:
+    """Samples a frame at the texels that it shows, in rows of a shape that cv2.remap takes."""
+
+    def __init__(self, texels: np.ndarray, width: int) -> None:
+        """texels [n]: indices into the atlas; width: of the atlas."""
+        self._count, rows = len(texels), -(-len(texels) // LOOKUP_ROW)
+        self._texels = np.zeros((rows, LOOKUP_ROW), np.int64)  # what fills the last row is texel 0
+        self._texels.ravel()[: len(texels)] = texels
+        self._columns = (self._texels % width).astype(np.float32)
+        self._rows = (self._texels // width).astype(np.float32)
+
+    def sample(self, picture: np.ndarray, layout: np.ndarray, offset: np.ndarray | None) -> np.ndarray:
+        """Values [n] of a picture [H, W] where its layout [h, w, 2] says that the texels lie, moved by an offset
+        [h, w, 2] in texels; None: by nothing."""
+        if offset is None:
+            places = layout.reshape(-1, 2).take(self._texels, 0)
+        else:
+            moved = offset.reshape(-1, 2).take(self._texels, 0)
+            places = cv2.remap(layout, self._columns + moved[..., 0], self._rows + moved[..., 1], cv2.INTER_LINEAR)
+        return sample(picture, places, cv2.INTER_CUBIC).ravel()[: self._count]
 
 
-def _gradient(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Central differences [h, w] along columns and rows."""
-    kernel = np.array([[-0.5, 0.0, 0.5]], np.float32)
-    return cv2.filter2D(image, cv2.CV_32F, kernel), cv2.filter2D(image, cv2.CV_32F, kernel.T)
+class _Windowed:
+    """Means over windows of values that only some texels have; the others count as 0."""
+
+    def __init__(self, shape: tuple[int, int], texels: np.ndarray, windows: Windows) -> None:
+        """shape (h, w) of the atlas; texels [n]: indices into it."""
+        self._shape, self._texels, self._ksize = shape, texels, (_window_width(windows.sigma),) * 2
+        self._images: dict[int, np.ndarray] = {}
+
+    def means(self, *values: np.ndarray) -> np.ndarray:
+        """1, 3 or 4 times values [n] -> [h, w] or [h, w, 3 or 4]: one pass for all."""
+        count = len(values)
+        if count not in self._images:
+            self._images[count] = np.zeros((*self._shape, count), np.float32)
+        image = self._images[count]
+        for k, value in enumerate(values):
+            image.reshape(-1, count)[self._texels, k] = value
+        return cv2.stackBlur(image, self._ksize)
+
+
+def _solved(normal: np.ndarray, pull: np.ndarray) -> np.ndarray:
+    """[n, 2] of the normal equations, damped a little where a window has no texture. normal [n, 4]: xx, xy, yy, x; pull
+    [n]: y."""
+    xy, x, y = normal[:, 1], normal[:, 3], pull
+    xx, yy = normal[:, 0] + 1.0, normal[:, 2] + 1.0
+    determinant = xx * yy - xy * xy
+    return np.stack([(yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant], axis=1)
 
 
 @dataclass(frozen=True)
-class _WindowSums:
-    """Window means [h, w] of the weighted products of gradients and of gradients with differences, and others."""
+class _WindowMeans:
+    """At the tracked texels [N]: of the weighted products of gradients, of the weight (cover), of the texels shown, and
+    of their squared differences."""
 
     xx: np.ndarray
     xy: np.ndarray
     yy: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
     cover: np.ndarray
     shown: np.ndarray
     squares: np.ndarray
-
-    def offset(self) -> np.ndarray:
-        """[h, w, 2] of the normal equations, damped a little where a window has no texture."""
-        xx, yy = self.xx + 1.0, self.yy + 1.0
-        determinant = xx * yy - self.xy * self.xy
-        return np.stack([yy * self.x - self.xy * self.y, xx * self.y - self.xy * self.x], -1) / determinant[..., None]
-
-
-def _window_sums(gradient, difference, known, weight, sigma) -> _WindowSums:
-    width = _window_width(sigma)
-
-    def mean(values):
-        return cv2.stackBlur(values, (width, width))
-
-    gx, gy = gradient
-    wx, wy = weight * gx, weight * gy
-    products = wx * gx, wx * gy, wy * gy, wx * difference, wy * difference, weight
-    # outliers don't pull, but a window full of them says little: its variance counts them
-    return _WindowSums(*(mean(values) for values in products), mean(known), mean(known * difference * difference))
 
 
 def _window_width(sigma: float) -> int:
     return 2 * int(round(2.0 * sigma)) + 1
 
 
-def _observations(atlas, placed, offset, sums, windows) -> tuple[np.ndarray, np.ndarray]:
+def _observations(atlas, placed, moved, means, windows) -> tuple[np.ndarray, np.ndarray]:
     """The flow at the tracked texels, taken to the picture with its covariance."""
-    at = atlas.rows, atlas.columns
-    moved = offset[at]
     place = np.stack([atlas.columns, atlas.rows], axis=1).astype(np.float32) + moved
     across, down = np.float32([2, 0]), np.float32([0, 2])
     stretch = np.stack(
         [0.25 * (_lookup(placed.layout, place + d) - _lookup(placed.layout, place - d)) for d in (across, down)], -1
     )
     pixels = 0.56 * _window_width(windows.sigma) ** 2  # texels that a triangular window amounts to
-    shown = sums.shown[at]
-    variance = (sums.squares[at] + 1e-3) / np.maximum(shown, 1e-6)
-    normal = np.stack([np.stack([sums.xx[at], sums.xy[at]], -1), np.stack([sums.xy[at], sums.yy[at]], -1)], -2)
+    shown = means.shown
+    variance = (means.squares + 1e-3) / np.maximum(shown, 1e-6)
+    normal = np.stack([np.stack([means.xx, means.xy], -1), np.stack([means.xy, means.yy], -1)], -2)
     information = normal.astype(np.float64) * (pixels / variance)[:, None, None]
-    good = (placed.shown[at] > 0) & (shown > LEAST_COVER) & (sums.cover[at] > LEAST_AGREEMENT * shown)
+    good = (placed.shown[atlas.rows, atlas.columns] > 0) & (shown > LEAST_COVER)
+    good &= means.cover > LEAST_AGREEMENT * shown
     good &= np.linalg.norm(moved, axis=1) < windows.search
     good &= (np.linalg.det(information) > 1e-8) & (np.abs(np.linalg.det(stretch)) > 1e-3)
     covariance = stretch[good] @ np.linalg.inv(information[good]) @ np.swapaxes(stretch[good], 1, 2)
