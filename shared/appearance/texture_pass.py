@@ -26,7 +26,7 @@ from shared.compute.run_context import SILENT, RunContext
 from shared.compute.threads import share_out
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer, is_inactive
-from shared.imaging.texels import FrameView, TexelSamples, TexelSurface, smooth_field
+from shared.imaging.texels import FrameView, SmoothFields, TexelSamples, TexelSurface
 from shared.imaging.views import Views
 from shared.rendering.shading import VertexShading
 
@@ -100,13 +100,14 @@ class TexturePass:
         mean = np.full(count, self.specular, np.float32)
         fitted = np.nonzero(self.views.fitted)[0]
         some = fitted[spread_frames(len(fitted), FIRST_PASS_FRAMES, self.views.light_index[fitted])]
-        (first,) = self._close(self._accumulate(None, some, "texture, first pass"), [mean])
+        fields = SmoothFields(self.surface.mesh, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD, self.region)
+        (first,) = self._close(self._accumulate(None, some, "texture, first pass"), [mean], fields)
         evidence = self._accumulate(first, fitted, "texture, second pass")
         pooled = [
             pooled_specular(self.surface, evidence.equations, width, mean=self.specular, sigma=self.sigma)
             for width in widths
         ]
-        candidates = self._close(evidence, pooled)
+        candidates = self._close(evidence, pooled, fields)
         errors = self.held_out_errors(candidates)
         best = int(np.argmin(errors))
         names = ["one value" if not np.isfinite(width) else f"{width:g} texels" for width in widths]
@@ -156,12 +157,14 @@ class TexturePass:
         part.add(samples, lit.irradiance, lit.reflection, robust, lit.shadow)
         border.add(samples)
 
-    def _close(self, evidence: Evidence, intensities: list[np.ndarray]) -> list[TexelMaterial]:
+    def _close(
+        self, evidence: Evidence, intensities: list[np.ndarray], fields: SmoothFields
+    ) -> list[TexelMaterial]:
         """Albedo for each of some given intensities [T]; channels left open by the samples follow the others and the
         neighbourhood."""
         equations, information, systematic = evidence.equations, evidence.information, evidence.systematic
         rough = [equations.solve_albedo(specular, 0.0, 1e-6) for specular in intensities]
-        around = self._surroundings(rough, information).astype(np.float32)
+        around = self._surroundings(rough, information, fields).astype(np.float32)
         certain = information / (1.0 + information)
         determined = (PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + systematic)).mean(1)
         pull = _ALBEDO_PULL + equations.ee * (systematic / PRIOR_SPREAD**2)
@@ -174,7 +177,7 @@ class TexturePass:
             found.append(TexelMaterial(albedo, specular, information.min(1)))
         return found
 
-    def _surroundings(self, rough: list[np.ndarray], information: np.ndarray) -> np.ndarray:
+    def _surroundings(self, rough: list[np.ndarray], information: np.ndarray, fields: SmoothFields) -> np.ndarray:
         """[V, 3, K] log albedo as smooth fields, of K results [T, 3]: texels that the clip tells little of follow
         those that it knows.
 
@@ -192,17 +195,16 @@ class TexturePass:
             level = (share * relative).sum(1, keepdims=True)
             brightness.append(self.surface.to_vertices(level, total)[0])
             tint.append(self.surface.to_vertices(relative - level, tint_precision)[0])
-        tint_field = self._field(np.stack(tint, axis=-1), tint_precision)
-        return typical[:, None] + self._field(np.stack(brightness, axis=-1), total) + tint_field
+        tint_field = self._field(np.stack(tint, axis=-1), tint_precision, fields)
+        return typical[:, None] + self._field(np.stack(brightness, axis=-1), total, fields) + tint_field
 
-    def _field(self, means: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    def _field(self, means: np.ndarray, precision: np.ndarray, fields: SmoothFields) -> np.ndarray:
         """Vertex values [V, C, K], means of texels of some precision [T, C] -> the smooth fields [V, C, K] through
         them; 0 far from any."""
         share, _ = self.surface.to_vertices(precision, np.ones_like(precision))
         # What leaves a texel as open as the prior does is mostly a model's error that its neighbours share.
         known = share**2 / (share + PRIOR_SPREAD**-2)
-        centre = np.zeros(precision.shape[1])
-        return smooth_field(self.surface.mesh, means, known, centre, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD, self.region)
+        return fields.through(means, known, np.zeros(precision.shape[1]))
 
     def held_out_errors(self, candidates: list[TexelMaterial]) -> list[float]:
         """Root mean square residual of each candidate on the held-out frames (linear, censored, weighted)."""

@@ -8,9 +8,11 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sparse
 from scipy.ndimage import distance_transform_edt
+from scipy.sparse.linalg import SuperLU
 
 from shared.compute.compiled import compiled
-from shared.compute.sparse_solve import factorised
+from shared.compute.sparse_solve import factorised, solved_by_factors_of_another
+from shared.compute.threads import share_out
 from shared.geometry.mesh import Mesh, rasterize_uv, vertex_adjacency
 from shared.imaging.image_sampling import Picture, View, sample_colours, sample_inside, sample_saturation, texel_size
 
@@ -125,35 +127,41 @@ class TexelSurface:
         return sums / np.maximum(total, 1e-12), total
 
 
-def smooth_field(
-    mesh: Mesh,
-    values: np.ndarray,
-    precision: np.ndarray,
-    mean: np.ndarray,
-    step: float,
-    spread: float,
-    region: np.ndarray | None = None,
-) -> np.ndarray:
-    """Most likely vertex values [V, C, ...] of fields that are smooth over the mesh, given values [V, C, ...] of some
-    precision [V, C].
+class SmoothFields:
+    """Fields that are smooth over a mesh, through what is known at its vertices.
 
-    Gaussian Markov field: neighbours differ by step, and a vertex from the mean [C] by spread, both standard
-    deviations. Where nothing is known it continues its surroundings and sinks to the mean. Works across texture seams,
-    which a fill in the image cannot. region [V]: neighbours in different ones have nothing in common. Reference:
-    [Rue2005], section 3.
+    Gaussian Markov field: neighbours differ by step, and a vertex from the mean by spread, both standard deviations.
+    Where nothing is known it continues its surroundings and sinks to the mean. Works across texture seams, which a fill
+    in the image cannot. region [V]: neighbours in different ones have nothing in common. Reference: [Rue2005],
+    section 3.
+
+    The first precisions are factorised, each vertex's mean over the channels, and serve all that come later.
     """
-    count = len(mesh.vertices)
-    adjacency = vertex_adjacency(mesh.faces, count).tocoo()
-    if region is not None:
-        adjacency.data = adjacency.data * (region[adjacency.row] == region[adjacency.col])
-    graph = sparse.diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency
-    prior = graph / step**2 + sparse.identity(count) / spread**2
-    result = np.empty(values.shape)
-    for c, known in enumerate(precision.T):
-        right = (values[:, c].reshape(count, -1).T * known + mean[c] / spread**2).T
-        solved = factorised(prior + sparse.diags(known)).solve(right)
-        result[:, c] = solved.reshape(result[:, c].shape)
-    return result
+
+    def __init__(self, mesh: Mesh, step: float, spread: float, region: np.ndarray | None = None):
+        count = len(mesh.vertices)
+        adjacency = vertex_adjacency(mesh.faces, count).tocoo()
+        if region is not None:
+            adjacency.data = adjacency.data * (region[adjacency.row] == region[adjacency.col])
+        graph = sparse.diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency
+        self._least = 1.0 / spread**2
+        self._prior = (graph / step**2 + sparse.identity(count) * self._least).tocsr()
+        self._factors: SuperLU | None = None
+
+    def through(self, values: np.ndarray, precision: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        """Most likely vertex values [V, C, ...], given values [V, C, ...] of some precision [V, C]; mean [C]."""
+        if self._factors is None:
+            typical = np.exp(np.log(precision + self._least).mean(1)) - self._least
+            self._factors = factorised(self._prior + sparse.diags(typical))
+        factors, count = self._factors, len(values)
+
+        def solved(c: int) -> np.ndarray:
+            known = precision[:, c]
+            right = (values[:, c].reshape(count, -1).T * known + mean[c] * self._least).T
+            return solved_by_factors_of_another(self._prior + sparse.diags(known), right, factors)
+
+        channels = share_out(values.shape[1], solved)
+        return np.stack([channel.reshape(values[:, 0].shape) for channel in channels], axis=1)
 
 
 @compiled

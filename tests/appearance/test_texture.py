@@ -13,7 +13,7 @@ from shared.appearance.texture import (
     pooled_specular,
     robust_weight,
 )
-from shared.imaging.texels import TexelSamples, smooth_field
+from shared.imaging.texels import SmoothFields, TexelSamples
 
 NOISE = Noise(0.01, 0.02)
 NEVER_WRONG = np.zeros((10, 3))
@@ -166,14 +166,14 @@ def test_field_continues_what_is_known_and_sinks_to_the_mean():
     values = np.stack([x + 2 * y, 3 - x], axis=1)
     rim = np.repeat((np.abs(plate.uvs - 0.5).max(1) > 0.49)[:, None], 2, axis=1)
     mean = np.array([0.3, -0.2])
-    found = smooth_field(plate, np.where(rim, values, 0.0), 1e6 * rim, mean, 0.05, 100.0)
+    found = SmoothFields(plate, 0.05, 100.0).through(np.where(rim, values, 0.0), 1e6 * rim, mean)
     assert np.allclose(found, values, atol=0.03)
     loose = plate.replace(
         vertices=np.concatenate([plate.vertices, plate.vertices + 5.0]),
         faces=np.concatenate([plate.faces, plate.faces + len(x)]),
     )
     known = np.repeat([[1.0, 1.0], [0.0, 0.0]], len(x), axis=0)
-    both = smooth_field(loose, np.tile(values, (2, 1)), known, mean, 0.05, 1.0)
+    both = SmoothFields(loose, 0.05, 1.0).through(np.tile(values, (2, 1)), known, mean)
     assert np.allclose(both[len(x) :], mean, atol=1e-6)
 
 
@@ -181,12 +181,12 @@ def test_field_stops_where_another_region_begins():
     plate = grid_plane(9, 1.0)
     region = plate.uvs[:, 0] > 0.45
     known = np.where(region, 0.0, 1e6)[:, None]
-    found = smooth_field(plate, np.full((len(region), 1), 2.0), known, np.zeros(1), 0.05, 1.0, region)[:, 0]
+    found = SmoothFields(plate, 0.05, 1.0, region).through(np.full((len(region), 1), 2.0), known, np.zeros(1))[:, 0]
     assert np.allclose(found[~region], 2.0, atol=1e-3) and np.allclose(found[region], 0.0, atol=1e-9)
 
 
 def test_field_weighs_values_by_their_precision():
     """One vertex against the mean: the posterior mean of two normal distributions."""
     plate = grid_plane(2, 1.0)
-    found = smooth_field(plate, np.full((4, 1), 2.0), np.full((4, 1), 3.0), np.array([0.0]), 0.05, 0.5)
+    found = SmoothFields(plate, 0.05, 0.5).through(np.full((4, 1), 2.0), np.full((4, 1), 3.0), np.array([0.0]))
     assert np.allclose(found, 2.0 * 3.0 / (3.0 + 4.0), atol=1e-9)
