@@ -1,5 +1,7 @@
 """Rays against known surfaces."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from shapes import grid_plane, sphere
 
@@ -51,6 +53,28 @@ def test_pixel_directions_pass_through_pixel_centres():
     directions = pixel_directions(lens, 4, 2)
     assert directions.shape == (2, 4, 3)
     assert np.allclose(directions[0, 0], [(0.5 - 2) / 50, (0.5 - 1) / 50, 1])
+
+
+def test_rays_of_several_threads_meet_what_those_of_one_meet():
+    """Each embreex ray query holds the interpreter's lock; these do not, and share one scene."""
+    ball, rng = sphere(1.0, 4), np.random.default_rng(5)
+    scene, origins = RayScene(ball.vertices, ball.faces), rng.uniform(-2.0, 2.0, (4, 5000, 3))
+    directions = rng.normal(size=origins.shape)
+    alone = [scene.first_faces(*rays) for rays in zip(origins, directions, strict=True)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(scene.first_faces, origins, directions))
+    np.testing.assert_array_equal(together, alone)
+    blocked = np.stack([scene.occluded(*rays) for rays in zip(origins, directions, strict=True)])
+    np.testing.assert_array_equal(blocked, np.stack(alone) >= 0)
+
+
+def test_no_ray_slips_between_faces():
+    """From within a closed surface, at its edges and corners."""
+    ball = sphere(1.0, 3)
+    middles = ball.vertices[ball.faces][:, :2].mean(1)
+    targets = np.concatenate([ball.vertices, middles])
+    face = RayScene(ball.vertices, ball.faces).first_faces(np.zeros_like(targets), targets)
+    assert (face >= 0).all()
 
 
 def test_places_on_faces_are_those_of_embree_in_doubles():

@@ -1,8 +1,8 @@
 """Renders many shots of one scene in worker processes.
 
-embree holds the interpreter lock, so work is spread over processes. Tasks are cut independently of their number, each
-carries its own random seed, and every worker uses one thread for its matrix products: the result does not depend on
-how many there are.
+Numpy holds the interpreter lock between its loops, so work is spread over processes. Tasks are cut independently of
+their number, each carries its own random seed, and every worker uses one thread for its matrix products: the result
+does not depend on how many there are.
 """
 
 from __future__ import annotations
