@@ -11,6 +11,7 @@ References: [Horn1975] (shape from shading); [Mikkelsen2008] (tangents of MikkTS
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,10 +27,12 @@ from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import FrameView, TexelSurface
 from shared.imaging.views import Views
-from shared.rendering.normal_derivatives import IrradianceVectors, Reflections
+from shared.rendering.irradiance_errors import irradiance_vectors
+from shared.rendering.normal_derivatives import Reflections
 from shared.rendering.shading import VertexShading
 
 FRAMES = 32
+_TOGETHER = 8
 RESOLVED_PX, WIDTH_OF_DEVIATION = 2.0, 2.355
 """Lenses and codecs resolve no single pixel. A Gaussian's width at half height is 2.355 standard deviations."""
 LEAST_POOL = 0.5
@@ -134,7 +137,6 @@ class NormalPass:
     ):
         self.surface, self.viewer, self.shading, self.views = surface, viewer, shading, views
         self.material, self.progress, self.noise = material, context.progress, noise or Noise()
-        self.vectors = IrradianceVectors(shading.transfer.visibility(), shading.directions, shading.light_along)
         self.reflections = Reflections(shading, np.arange(len(shading.points)))
         normals = normalised(surface.interpolate(viewer.normals))
         self.tangents = uv_tangents(surface.mesh, normals, surface.face, surface.bary)
@@ -160,18 +162,30 @@ class NormalPass:
     def accumulate(self, frames: np.ndarray) -> ReliefEquations:
         """The equations of some frames [n] int, numbers of views."""
         sums = ReliefSums(len(self.surface))
-        for view in read_ahead(map(self.view, self.progress(frames, "fine normals"))):
+        for view in read_ahead(self.frame_views(self.progress(frames, "fine normals"), frames)):
             self._add(view, sums)
         return sums.equations()
 
-    def view(self, f: int) -> FrameView:
-        """One frame with E, S [3] and their derivatives by the normal [3, 3] of each vertex, 24 values."""
+    def frame_views(self, shown: Iterable[int], frames: np.ndarray) -> Iterator[FrameView]:
+        """view(f) of the frames [n], which shown gives one by one. The derivative of E is W, see irradiance_vectors;
+        that of some frames is one product."""
+        shading = self.shading
+        for k, f in enumerate(shown):
+            if k % _TOGETHER == 0:
+                light = shading.light_along[:, frames[k : k + _TOGETHER]].reshape(len(shading.directions), -1)
+                vectors = irradiance_vectors(shading.transfer, light, shading.directions)
+            first = 3 * (k % _TOGETHER)
+            yield self.view(f, vectors[..., first : first + 3].transpose(0, 2, 1))
+
+    def view(self, f: int, slope: np.ndarray) -> FrameView:
+        """One frame with E, S [3] and their derivatives by the normal [3, 3] of each vertex, 24 values; slope [P, 3
+        channels, 3]: that of E at the shading's points."""
         views, shading = self.views, self.shading
         pose, picture, lens = views.camera_from_head[f], views.picture(f), views.intrinsics[f]
         view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
-        slope = self.vectors.frames(slice(f, f + 1))[:, 0]
         reflection, reflection_slope = self.reflections.at(f, shading.points.normals)
-        of_points = np.concatenate([reflection, slope.reshape(-1, 9), reflection_slope.reshape(-1, 9)], axis=1)
+        columns = [reflection, slope.reshape(-1, 9), reflection_slope.reshape(-1, 9)]
+        of_points = np.concatenate(columns, axis=1, dtype=np.float32, casting="same_kind")
         values = np.concatenate([shading.irradiance(f), of_points[shading.stand_in]], axis=1)
         return self.surface.frame_view(view, picture, lens, values)
 

@@ -11,6 +11,11 @@ import torch
 Result = TypeVar("Result")
 
 
+def thread_count() -> int:
+    """How many this process may use, for libraries that want to be told."""
+    return torch.get_num_threads()
+
+
 def share_out(count: int, work: Callable[[int], Result]) -> list[Result]:
     """Does work(0) to work(count - 1), on as many threads as torch may use -> what they return, in order.
 
@@ -24,7 +29,7 @@ def share_out(count: int, work: Callable[[int], Result]) -> list[Result]:
         for number in numbers:
             results[number] = work(number)
 
-    others = min(torch.get_num_threads(), count) - 1
+    others = min(thread_count(), count) - 1
     if others < 1:
         toil()
         return results

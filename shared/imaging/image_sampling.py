@@ -72,7 +72,8 @@ class Samples:
 
 
 class SurfaceViewer:
-    """A mesh as cameras see it: vertex visibility by rays, eroded by a margin on the surface.
+    """A mesh as cameras see it: vertex visibility by rays, eroded by a margin on the surface. Pass after pass looks
+    through the same cameras, so what one sees is kept, a bit per vertex.
 
     layout [V, 3]: where its vertices lie when some of them are chosen to stand for the surface. Of a refined mesh these
     are the places before: its own differ by what the light was solved to, and one that crosses a cell's edge would
@@ -85,6 +86,7 @@ class SurfaceViewer:
         self.error_mm, self.least_cosine = 0.0, MINIMUM_VIEW_COSINE
         self.normals = vertex_normals(mesh.vertices, mesh.faces)
         self._vertices, self._normals = mesh.vertices, self.normals
+        self._shown: dict[tuple, np.ndarray] = {}
         edges = half_edges(mesh.faces)
         length = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
         self.rings = max(1, round(margin_mm / float(np.median(length))))
@@ -101,7 +103,7 @@ class SurfaceViewer:
         """The same for a surface that may be off by error_mm: it leaves out what is so close to the rim that the
         picture may show there what lies behind. At cosine c a ball of radius R lies R c^2 / 2 within its rim."""
         viewer = copy(self)
-        viewer.error_mm = error_mm
+        viewer.error_mm, viewer._shown = error_mm, {}
         rim = np.sqrt(4.0 * error_mm / BALL_MM)
         viewer.least_cosine = float(np.clip(rim, MINIMUM_VIEW_COSINE, MAXIMUM_LEAST_COSINE))
         return viewer
@@ -113,7 +115,7 @@ class SurfaceViewer:
         wanted[index] = True
         chosen = np.nonzero(self.grown(wanted))[0]
         viewer = copy(self)
-        viewer._vertices, viewer._normals = self._vertices[chosen], self._normals[chosen]
+        viewer._vertices, viewer._normals, viewer._shown = self._vertices[chosen], self._normals[chosen], {}
         viewer._adjacency = self._adjacency[chosen][:, chosen]
         return viewer, np.searchsorted(chosen, index)
 
@@ -125,15 +127,17 @@ class SurfaceViewer:
         towards = centre - vertices
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         cosine = (towards * normals).sum(1)
-        within = ((pixels > 1.0) & (pixels < np.array(size) - 1.0)).all(1) & (depth > 0)
-        seen = within & (cosine > self.least_cosine)
-        index = np.nonzero(seen)[0]
-        origins = vertices[index] + RAY_START_MM * normals[index]
-        hidden = index[self.scene.occluded(origins, towards[index])]
-        weight = np.where(seen, cosine**2, 0.0)
-        covered = np.zeros(len(vertices), bool)
-        covered[hidden] = True
-        weight[self.grown(covered)] = 0.0
+        camera = camera_from_head.tobytes(), intrinsics.tobytes(), tuple(size)
+        if camera not in self._shown:
+            within = ((pixels > 1.0) & (pixels < np.array(size) - 1.0)).all(1) & (depth > 0)
+            seen = within & (cosine > self.least_cosine)
+            index = np.nonzero(seen)[0]
+            origins = vertices[index] + RAY_START_MM * normals[index]
+            covered = np.zeros(len(vertices), bool)
+            covered[index[self.scene.occluded(origins, towards[index])]] = True
+            self._shown[camera] = np.packbits(seen & ~self.grown(covered))
+        shown = np.unpackbits(self._shown[camera], count=len(vertices)).astype(bool)
+        weight = np.where(shown, cosine**2, 0.0)
         return View(pixels, depth, cosine, towards, weight.astype(np.float32))
 
     def grown(self, chosen: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from shared.compute.threads import thread_count
 from shared.geometry.mesh import tangent_frames
 from shared.rendering.transfer import Points, Transfer, position_and_normal
 
@@ -56,7 +57,7 @@ def places_around(points: Points, reach_mm: float) -> np.ndarray:
         angle = 2.0 * np.pi * k / _PLACES
         beside = np.cos(angle) * tangents[:, 0] + np.sin(angle) * tangents[:, 1]
         moved = points.positions + reach_mm * (1.0 if k % 2 else 0.5) * beside
-        near.append(tree.query(position_and_normal(Points(moved, points.normals)))[1])
+        near.append(tree.query(position_and_normal(Points(moved, points.normals)), workers=thread_count())[1])
     return np.stack(near, axis=1)
 
 

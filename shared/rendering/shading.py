@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from shared.compute.threads import share_out, thread_count
 from shared.geometry.mesh import normalised
 from shared.geometry.transforms import camera_centres, vector_from_rotation, world_from_head
 from shared.rendering.brdf import hemispherical_albedo
@@ -31,6 +32,8 @@ KEY_STEP = 0.05
 
 DEEP = 0.9
 """Cosine-weighted share of the hemisphere that the head itself covers, from which on a point counts as in a cavity."""
+
+_POINTS_PER_BLOCK = 512
 
 LARGEST_SHARE = 0.95
 """Of the light that arrives, what a surface can send on: were it all of it, bounces would not end."""
@@ -184,13 +187,14 @@ class VertexShading:
             towards, blocked = self.towards_camera(frame), self.blocked_light(frame)
             facing = np.nonzero((towards * self.points.normals).sum(1) > -0.1)[0]
             value = np.zeros((len(self.points), 3), np.float16)
-            value[facing] = specular_reflection(
-                self.table.take(facing),
-                towards[facing],
-                self.roughness_of(facing),
-                self.light_along[:, frame],
-                blocked[facing],
-            )
+            light = np.ascontiguousarray(self.light_along[:, frame])
+
+            def reflect(k: int) -> None:
+                rows = facing[k * _POINTS_PER_BLOCK : (k + 1) * _POINTS_PER_BLOCK]
+                roughness = self.roughness_of(rows)
+                value[rows] = specular_reflection(self.table.take(rows), towards[rows], roughness, light, blocked[rows])
+
+            share_out(-(-len(facing) // _POINTS_PER_BLOCK), reflect)
             self._key_reflection[frame] = value
         return self._key_reflection[frame]
 
@@ -203,7 +207,8 @@ def _stand_ins(vertices: np.ndarray, index: np.ndarray, blocked: np.ndarray, dee
     result = np.full(len(vertices), -1)
     result[index[open_points]] = open_points
     others = np.nonzero(result < 0)[0]
-    result[others] = open_points[cKDTree(vertices[index[open_points]]).query(vertices[others])[1]]
+    tree = cKDTree(vertices[index[open_points]])
+    result[others] = open_points[tree.query(vertices[others], workers=thread_count())[1]]
     return result
 
 

@@ -21,10 +21,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 
 from shared.compute.compiled import compiled
-from shared.compute.threads import share_out
+from shared.compute.threads import share_out, thread_count
 from shared.geometry.embree import FACE, FAR, FARTHEST, GEOMETRY, MASK, call_embree, ray_buffer
 from shared.geometry.mesh import Mesh, normalised, vertex_normals
 from shared.geometry.raycast import RAY_START_MM, RayScene
@@ -131,7 +132,7 @@ def position_and_normal(points: Points) -> np.ndarray:
 
 def nearest_points(target: Points, source: Points) -> np.ndarray:
     """For each target point [P] the index of the nearest source point, counting position and orientation."""
-    return cKDTree(position_and_normal(source)).query(position_and_normal(target))[1]
+    return cKDTree(position_and_normal(source)).query(position_and_normal(target), workers=thread_count())[1]
 
 
 def bounce_nodes(mesh: Mesh, count: int, layout: np.ndarray | None = None) -> Nodes:
@@ -247,9 +248,9 @@ def bounced_irradiance(transfer: Transfer, radiosity: np.ndarray, batch: int = 4
 
 
 def _widened_product(table: np.ndarray, values: np.ndarray, batch: int) -> np.ndarray:
-    values = np.ascontiguousarray(values, np.float32)
-    result = np.empty((len(table), values.shape[1]), np.float32)
+    factor = torch.from_numpy(np.ascontiguousarray(values, np.float32))
+    result = torch.empty((len(table), values.shape[1]))
     for start in range(0, len(result), batch):
         part = slice(start, start + batch)
-        np.matmul(table[part].astype(np.float32), values, out=result[part])
-    return result
+        torch.matmul(torch.from_numpy(table[part]).float(), factor, out=result[part])
+    return result.numpy()
