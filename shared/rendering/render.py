@@ -12,9 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from shared.compute.compiled import compiled
+from shared.compute.threads import share_out
 from shared.geometry.raycast import camera_hits
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.rendering.shading import VertexShading
+
+_ROWS_PER_BAND = 32
 
 
 @dataclass(frozen=True)
@@ -47,14 +50,22 @@ def render_frame(
     albedo = np.ascontiguousarray(maps.albedo, np.float32)
     intensity = np.ascontiguousarray(maps.specular_intensity, np.float32)
     radiance, hits = np.zeros((height * width, 3), np.float32), np.zeros(height * width, np.float32)
-    for row in range(samples):
-        for column in range(samples):
-            offsets = (column + 0.5) / samples, (row + 0.5) / samples
-            face, bary, _ = camera_hits(viewer.scene, camera_from_head, intrinsics, width, height, offsets)
-            _add_radiance(
-                face.ravel(), bary.reshape(-1, 3), mesh.faces, mesh.face_uvs, uvs, albedo, intensity, shade, radiance,
-                hits
-            )
+
+    def render(band: int) -> None:
+        first = band * _ROWS_PER_BAND
+        rows = min(_ROWS_PER_BAND, height - first)
+        lens = intrinsics - np.array([[0.0, 0.0, 0.0], [0.0, 0.0, first], [0.0, 0.0, 0.0]])
+        pixels = slice(first * width, (first + rows) * width)
+        for row in range(samples):
+            for column in range(samples):
+                offsets = (column + 0.5) / samples, (row + 0.5) / samples
+                face, bary, _ = camera_hits(viewer.scene, camera_from_head, lens, width, rows, offsets)
+                _add_radiance(
+                    face.ravel(), bary.reshape(-1, 3), mesh.faces, mesh.face_uvs, uvs, albedo, intensity, shade,
+                    radiance[pixels], hits[pixels]
+                )
+
+    share_out(-(-height // _ROWS_PER_BAND), render)
     radiance /= np.maximum(hits, 1.0)[:, None]
     return radiance.reshape(height, width, 3), (hits / samples**2).reshape(height, width)
 
