@@ -164,7 +164,7 @@ def _aperture_rows(model, fit, landmarks, deviation_mm) -> tuple[np.ndarray, np.
     chosen[pairs] = True
     place = np.cumsum(chosen) - 1
     by_code = _landmark_basis(model, model.expression_basis, chosen)[..., 1]
-    heights = model.landmarks(model.shape(fit.identity, np.zeros_like(fit.expression)))[:, 1]
+    heights = model.landmarks(model.shape(fit.identity))[:, 1]
     observed = fit.to_head(landmarks)[:, 1]
     rows = np.zeros((len(pairs), 7 + len(fit.identity) + len(fit.expression)))
     rows[:, 7 + len(fit.identity) :] = (by_code[:, place[pairs[:, 0]]] - by_code[:, place[pairs[:, 1]]]).T

@@ -65,11 +65,20 @@ class AtlasTracker:
         self._scene, self._normals = RayScene(vertices, model.faces), vertex_normals(vertices, model.faces)
         self._pictures = clip.detail if settings.detail else clip.contrast
         self._shrink = max(1, round(settings.texel_px))
+        self._visible: dict[bytes, np.ndarray] = {}
+
+    def _visible_from(self, camera_from_head: np.ndarray) -> np.ndarray:
+        """[V] bool, traced once for each pose."""
+        key = camera_from_head.tobytes()
+        if key not in self._visible:
+            self._visible[key] = visible_vertices(
+                self._scene, self._vertices, self._normals, camera_from_head, LEAST_COSINE
+            )
+        return self._visible[key]
 
     def place(self, frame: int, camera_from_head: np.ndarray) -> PlacedFrame:
         """Where a frame shows the atlas, for a believed pose."""
-        visible = visible_vertices(self._scene, self._vertices, self._normals, camera_from_head, LEAST_COSINE)
-        unusable = self._clip.unusable[frame]
+        visible, unusable = self._visible_from(camera_from_head), self._clip.unusable[frame]
         return place_frame(self.atlas, self._vertices, camera_from_head, self._clip.intrinsics, visible, unusable)
 
     def _picture(self, frame: int) -> np.ndarray:

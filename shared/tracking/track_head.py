@@ -7,6 +7,7 @@ are tracked against it twice, first widely, then in the finest detail, and each 
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -104,9 +105,10 @@ def track_head(
     found = flow_over_head(few, model, _fit(few, model, found, settings)[0], found, settings.flow, progress)
     note(_summary("flow over the head", found))
     refuse_still_head(found.solution.camera_from_points[found.reliable])
-    elsewhere = focal_elsewhere(few, found)
-
-    fit, _ = _fit(few, model, found, settings)
+    with ThreadPoolExecutor(1) as beside:
+        searching = beside.submit(focal_elsewhere, few, found)
+        fit, _ = _fit(few, model, found, settings)
+        elsewhere = searching.result()
     poses, known = _onto_all(clip, model, chosen, fit, found)
     found = _texture_pass(clip, model, fit, poses, known, coarse_pass(clip.face_width_px), progress)
     note(_summary("tracks", found))
