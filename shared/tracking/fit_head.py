@@ -164,11 +164,13 @@ def _aperture_rows(model, fit, landmarks, deviation_mm) -> tuple[np.ndarray, np.
     chosen[pairs] = True
     place = np.cumsum(chosen) - 1
     by_code = _landmark_basis(model, model.expression_basis, chosen)[..., 1]
-    heights = model.landmarks(model.shape(fit.identity))[:, 1]
+    neutral = interpolate(model.template, model.faces, model.landmark_face[chosen], model.landmark_bary[chosen])[:, 1]
+    heights = neutral + fit.identity @ _landmark_basis(model, model.identity_basis, chosen)[..., 1]
     observed = fit.to_head(landmarks)[:, 1]
     rows = np.zeros((len(pairs), 7 + len(fit.identity) + len(fit.expression)))
     rows[:, 7 + len(fit.identity) :] = (by_code[:, place[pairs[:, 0]]] - by_code[:, place[pairs[:, 1]]]).T
-    missing = (observed[pairs[:, 0]] - observed[pairs[:, 1]]) - (heights[pairs[:, 0]] - heights[pairs[:, 1]])
+    open_when_neutral = heights[place[pairs[:, 0]]] - heights[place[pairs[:, 1]]]
+    missing = observed[pairs[:, 0]] - observed[pairs[:, 1]] - open_when_neutral
     return rows / deviation_mm, missing / deviation_mm
 
 
