@@ -10,6 +10,7 @@ References: [Kroeger2016] (dense inverse search); [Kalal2010] (the forward-backw
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -64,8 +65,14 @@ class SurfaceGrid:
     def warp(self, values: np.ndarray) -> np.ndarray:
         """Vertex values [V, C] -> [h, w, C] float32, rounded once: sums in single precision end differently by the
         processor, and 8-bit pictures sampled there then differ by a code."""
-        taken = values.astype(np.float64)[self.corners]
-        return np.einsum("hwkc,hwk->hwc", taken, self.bary.astype(np.float64)).astype(np.float32)
+        columns = values.astype(np.float64).T.copy()
+        warped = [sum(column.take(corner) * weight for corner, weight in self._corner_planes) for column in columns]
+        return np.stack(warped, axis=-1).astype(np.float32)
+
+    @cached_property
+    def _corner_planes(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Vertex index [h, w] and weight [h, w] of each corner."""
+        return [(self.corners[..., k].copy(), self.bary[..., k].astype(np.float64)) for k in range(3)]
 
 
 def grid_from_landmarks(landmarks_px: np.ndarray, reference: int, scale: float) -> SurfaceGrid:
