@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from shared.compute.parallel import shared_out
 from shared.errors import InputError
 from shared.geometry.mesh import normalised, vertex_normals
 from shared.geometry.raycast import RayScene
@@ -107,10 +108,10 @@ def landmark_poses(clip: TrackedClip, named: np.ndarray) -> list[np.ndarray | No
     named [n, 3] of the 468 landmarks on the head, NaN where the model has none.
     """
     known, reach_px = np.isfinite(named[:, 0]), LANDMARK_REACH * clip.face_width_px
-    poses = [
-        pose_from_points(named[known], frame[known], clip.intrinsics, clip.size, reach_px)
-        for frame in clip.landmarks_px
-    ]
+    poses = shared_out(
+        lambda frame: pose_from_points(named[known], frame[known], clip.intrinsics, clip.size, reach_px),
+        clip.landmarks_px,
+    )
     return [pose if pose is not None and pose[2, 3] > 0 else None for pose in poses]
 
 
