@@ -91,10 +91,12 @@ class VertexShading:
         self._key_step = key_step
         self._light(light, camera_from_head, moves, light_index)
 
-    def under(self, light: np.ndarray, camera_from_head: np.ndarray, moves: str) -> VertexShading:
-        """The same surface under one other light, in other frames."""
+    def under(
+        self, light: np.ndarray, camera_from_head: np.ndarray, moves: str, light_index: np.ndarray | None = None
+    ) -> VertexShading:
+        """The same surface under another light, or under several, in other frames."""
         other = copy(self)
-        other._light(light, camera_from_head, moves, None)
+        other._light(light, camera_from_head, moves, light_index)
         return other
 
     def _light(self, light, camera_from_head, moves, light_index) -> None:

@@ -68,7 +68,7 @@ def make_views(
     again = views.render(envmap, list(held_out.values()), moves, fade=False) if held_out else []
     return ViewSet(
         dict(zip(NOVEL_VIEWS, novel, strict=True)),
-        {name: views.render(studio_light(name), [camera])[0] for name in STUDIO_LIGHTS},
+        dict(zip(STUDIO_LIGHTS, views.relit([studio_light(name) for name in STUDIO_LIGHTS], camera), strict=True)),
         {roughness: views.visibility(front, roughness) for roughness in ROUGHNESSES},
         dict(zip(held_out, again, strict=True)),
     )
@@ -184,8 +184,15 @@ class HeadViews:
         moves "camera": the light is given in head space; "head": in the world of geometry.world_from_head. fade: pixels
         that the head covers in part are darker by the rest; else they show the mean of the part.
         """
-        poses = np.stack([camera.camera_from_head for camera in cameras])
-        shading = self._shading(np.maximum(cube_from_latlong(light, self.light_resolution), 0.0), poses, moves)
+        return self._pictures(self._shading([light], cameras, moves), cameras, fade)
+
+    def relit(self, lights: Sequence[np.ndarray], camera: ViewCamera) -> list[np.ndarray]:
+        """A picture, as of render, for each of several lights, given in head space."""
+        cameras = [camera] * len(lights)
+        return self._pictures(self._shading(lights, cameras, "camera"), cameras, fade=True)
+
+    def _pictures(self, shading: VertexShading, cameras: Sequence[ViewCamera], fade: bool) -> list[np.ndarray]:
+        """A camera's picture in each of the shading's frames."""
         pictures = []
         for k, camera in enumerate(cameras):
             picture, covered = render_frame(
@@ -194,8 +201,11 @@ class HeadViews:
             pictures.append(picture * covered[..., None] if fade else picture)
         return pictures
 
-    def _shading(self, light: np.ndarray, poses: np.ndarray, moves: str) -> VertexShading:
-        """Under a cubemap light; what no light changes is made once."""
+    def _shading(self, lights: Sequence[np.ndarray], cameras: Sequence[ViewCamera], moves: str) -> VertexShading:
+        """Under one light for all cameras, or one for each; what no light changes is made once."""
+        poses = np.stack([camera.camera_from_head for camera in cameras])
+        cubes = [np.maximum(cube_from_latlong(light, self.light_resolution), 0.0) for light in lights]
+        light, light_index = np.concatenate(cubes), None if len(lights) == 1 else np.arange(len(lights))
         if self._lit is None:
             self._lit = VertexShading(
                 self.index,
@@ -210,9 +220,10 @@ class HeadViews:
                 moves,
                 key_step=0.0,
                 deep=self.deep,
+                light_index=light_index,
             )
             return self._lit
-        return self._lit.under(light, poses, moves)
+        return self._lit.under(light, poses, moves, light_index)
 
     def coverage(self, camera: ViewCamera) -> np.ndarray:
         """[h, w] in 0 .. 1: how much of each pixel the head covers, as render counts it."""

@@ -65,6 +65,15 @@ def test_lamps_light_the_side_they_stand_on():
     assert above[:half].sum() > 5 * above[half:].sum()
 
 
+def test_lights_side_by_side_give_the_pictures_of_each_alone():
+    views, camera = HeadViews(ball(), ball_maps(0.7), SIZES), orbit_camera(ball(), 20.0, 10.0, PIXELS)
+    lights = [lamp(*place, (1, 1, 1), 15) for place in ((-70, 0), (70, 0), (0, 70))]
+    together = views.relit(lights, camera)
+    for light, picture in zip(lights, together, strict=True):
+        alone = views.render(light, [camera])[0]
+        np.testing.assert_allclose(picture, alone, atol=2e-3 * alone.max())
+
+
 def test_orbit_cameras_stand_where_they_say():
     mesh = ball()
     for yaw, pitch in ((0, 0), (90, 0), (-50, 20), (10, -80)):
