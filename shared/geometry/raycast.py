@@ -38,22 +38,25 @@ class RayScene:
         Distances are in units of the direction's length; where nothing is hit they are infinite.
         """
         face, place = self._traced(self.triangles.intersect, origins, directions)
-        distance = np.where(face < 0, np.float32(np.inf), place[:, 3])
-        return face, place[:, :3], distance
+        u, v, distance = place.T
+        bary = np.stack([1.0 - u - v, u, v], axis=1)  # here, since compiled sums may be reordered
+        missed = face < 0
+        bary[missed] = 0.0
+        return face, bary, np.where(missed, np.float32(np.inf), distance)
 
     def _traced(
         self, function: np.uint64, origins: np.ndarray, directions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """By embree's function -> face [N], corner weights and distance [N, 4], 0 where nothing is hit."""
+        """By embree's function -> face [N], its u and v and the distance [N, 3], 0 where nothing is hit."""
         origins, directions = np.asarray(origins, np.float32), np.asarray(directions, np.float32)
-        face, place = np.empty(len(origins), np.int32), np.zeros((len(origins), 4), np.float32)
+        face, place = np.empty(len(origins), np.int32), np.zeros((len(origins), 3), np.float32)
         _trace(function, self.triangles.scene, *ray_buffer(), origins, directions, face, place)
         return face, place
 
 
 @compiled
 def _trace(function, scene, ray, words, address, origins, directions, face, place):
-    """Rays [N, 3] -> face [N], -1: none; where rtcIntersect1 hits: corner weights and distance [N, 4]."""
+    """Rays [N, 3] -> face [N], -1: none; where rtcIntersect1 hits: u, v and distance [N, 3]."""
     for n in range(len(origins)):
         for k in range(3):
             ray[k], ray[4 + k] = origins[n, k], directions[n, k]
@@ -63,8 +66,7 @@ def _trace(function, scene, ray, words, address, origins, directions, face, plac
         face[n] = -1
         if words[GEOMETRY] != -1:
             face[n] = words[FACE]
-            place[n, 0], place[n, 1], place[n, 2] = np.float32(1.0) - ray[U] - ray[V], ray[U], ray[V]
-            place[n, 3] = ray[FARTHEST]
+            place[n, 0], place[n, 1], place[n, 2] = ray[U], ray[V], ray[FARTHEST]
         elif words[FARTHEST] < 0:  # rtcOccluded1 says so by an infinite negative distance, and not what it met
             face[n] = 0
 
