@@ -41,16 +41,24 @@ def average_frames(job: Job, views, texels, viewer) -> tuple:
     import numpy as np
 
     from shared.compute.read_ahead import read_ahead
+    from shared.compute.threads import share_out
     from shared.imaging.frame_index import spread_frames
 
     total, weight = np.zeros((len(texels), 3), np.float32), np.zeros(len(texels), np.float32)
     chosen = spread_frames(len(views), job.params.frames)
-    pictures = read_ahead(map(views.picture, job.progress(chosen, "projecting frames", total=len(chosen))))
-    for f, picture in zip(chosen, pictures, strict=True):
+
+    def look(f: int):
         view = viewer.view(views.camera_from_head[f], views.intrinsics[f], views.size)
-        samples, _ = texels.samples(texels.frame_view(view, picture, views.intrinsics[f]))
-        total[samples.rows] += samples.weight[:, None] * samples.colours
-        weight[samples.rows] += samples.weight
+        return texels.frame_view(view, views.picture(f), views.intrinsics[f])
+
+    def add(view, rows) -> None:
+        samples, _ = texels.samples(view, rows)
+        total[rows] += samples.weight[:, None] * samples.colours
+        weight[rows] += samples.weight
+
+    for view in read_ahead(map(look, job.progress(chosen, "projecting frames", total=len(chosen)))):
+        blocks = view.blocks()
+        share_out(len(blocks), lambda k, view=view, blocks=blocks: add(view, blocks[k]))
     return total / np.maximum(weight, 1e-6)[:, None], weight
 
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
-
-import torch
 
 Result = TypeVar("Result")
 
 
 def thread_count() -> int:
-    """How many this process may use, for libraries that want to be told."""
-    return torch.get_num_threads()
+    """How many this process may use: as many as torch, which is not loaded for that; what it would go by then."""
+    if "torch" in sys.modules:
+        return sys.modules["torch"].get_num_threads()
+    return int(os.environ.get("OMP_NUM_THREADS", "").partition(",")[0] or os.cpu_count() or 1)
 
 
 def share_out(count: int, work: Callable[[int], Result]) -> list[Result]:

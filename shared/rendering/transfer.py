@@ -21,7 +21,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
 
 from shared.compute.compiled import compiled
@@ -248,9 +247,12 @@ def bounced_irradiance(transfer: Transfer, radiosity: np.ndarray, batch: int = 4
 
 
 def _widened_product(table: np.ndarray, values: np.ndarray, batch: int) -> np.ndarray:
-    factor = torch.from_numpy(np.ascontiguousarray(values, np.float32))
-    result = torch.empty((len(table), values.shape[1]))
-    for start in range(0, len(result), batch):
-        part = slice(start, start + batch)
-        torch.matmul(torch.from_numpy(table[part]).float(), factor, out=result[part])
-    return result.numpy()
+    values = np.ascontiguousarray(values, np.float32)
+    result = np.empty((len(table), values.shape[1]), np.float32)
+
+    def multiply(k: int) -> None:
+        part = slice(k * batch, (k + 1) * batch)
+        np.matmul(table[part].astype(np.float32), values, out=result[part])
+
+    share_out(-(-len(result) // batch), multiply)
+    return result
