@@ -18,6 +18,7 @@ BENCHES = {
     "backwards": "tracking:BackwardsBench",
     "colour_chart": "colour_chart:ColourChartBench",
     "shading": "shading:ShadingBench",
+    "profile": "profile:ProfileBench",
 }
 """{name: module of tools.bench and its bench}; imported when asked for, since some need a minute or a peer."""
 

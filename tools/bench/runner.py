@@ -193,7 +193,8 @@ class Entry:
         self.table.rows += new
         self.bench.write(self.table)
         for row in new:
-            print("  ".join(self.bench.say(row)), flush=True)
+            if words := self.bench.say(row):
+                print("  ".join(words), flush=True)
 
 
 class Bench:
