@@ -19,6 +19,7 @@ BENCHES = {
     "colour_chart": "colour_chart:ColourChartBench",
     "shading": "shading:ShadingBench",
     "profile": "profile:ProfileBench",
+    "growth": "growth:GrowthBench",
 }
 """{name: module of tools.bench and its bench}; imported when asked for, since some need a minute or a peer."""
 

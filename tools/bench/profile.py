@@ -123,13 +123,13 @@ class ProfileBench(Bench):
         """Rows of `limn run` less its one missing stage, and of a finished subject."""
         self._need(list(self.pipeline.stages))
         shutil.rmtree(self.root / folder_of(LAST))
-        command = [sys.executable, "-m", "tools.limn", "run", str(self.subject.folder), "--out", str(self.work)]
+        command = [str(self.subject.folder), "--out", str(self.work)]
         command += ["--preset", self.options.preset, *(text for name in self.given for text in self._settings(name))]
-        wall, cpu = _seconds_of(command)
+        wall, cpu = limn_run(command)
         stage = read_json(self.root / folder_of(LAST) / PROVENANCE)
         started = {"phase": "workflow's start", "wall_s": wall - stage["wall_s"], "cpu_s": cpu - stage["cpu_s"],
                    "what": f"limn run, {LAST} missing, less that stage's own work"}  # fmt: skip
-        wall, cpu = _seconds_of(command)
+        wall, cpu = limn_run(command)
         finished = {"phase": "finished subject", "wall_s": wall, "cpu_s": cpu, "what": "limn run, nothing missing"}
         return [started, finished]
 
@@ -184,8 +184,9 @@ def _top(functions: Mapping[str, float]) -> list[tuple[str, float]]:
     return sorted(functions.items(), key=lambda pair: -pair[1])[:TOP]
 
 
-def _seconds_of(command: Sequence[str]) -> tuple[float, float]:
+def limn_run(arguments: Sequence[str]) -> tuple[float, float]:
     """Wall and processor seconds of a call of limn. InputError with its last words where it fails."""
+    command = [sys.executable, "-m", "tools.limn", "run", *arguments]
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     answer = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
     wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
