@@ -20,6 +20,7 @@ BENCHES = {
     "shading": "shading:ShadingBench",
     "profile": "profile:ProfileBench",
     "growth": "growth:GrowthBench",
+    "throughput": "throughput:ThroughputBench",
 }
 """{name: module of tools.bench and its bench}; imported when asked for, since some need a minute or a peer."""
 
