@@ -2,15 +2,15 @@
 
 import pytest
 
-from tools.bench.schedule import StageCost, serial_share, simulate
+from tools.bench.schedule import MeasuredStage, serial_share, simulate
 from tools.bench.throughput import compared
 
-STAGES = [StageCost("a", 10.0, 0.0, 100.0), StageCost("b", 30.0, 0.5, 400.0)]
+STAGES = [MeasuredStage("a", 10.0, 0.0, 100.0), MeasuredStage("b", 30.0, 0.5, 400.0)]
 
 
 def test_serial_shares_give_back_the_wall_time():
     for serial in (0.0, 0.3, 1.0):
-        cost = StageCost("a", 12.0, serial, 0.0)
+        cost = MeasuredStage("a", 12.0, serial, 0.0)
         assert serial_share(cost.seconds(2), 12.0, 2) == pytest.approx(serial)
 
 

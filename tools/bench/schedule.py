@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class StageCost:
+class MeasuredStage:
     """cpu_s: processor seconds; serial: their share, 0 to 1, that one thread has to do alone; mem_mb: what it books."""
 
     name: str
@@ -34,7 +34,7 @@ def serial_share(wall_s: float, cpu_s: float, threads: int) -> float:
 
 
 @dataclass(frozen=True)
-class Schedule:
+class SimulatedSchedule:
     """seconds: until all are done; busy: share of the cores at work; peak_mb: most that was booked at once; limits:
     {what: seconds that no schedule with that limit alone can beat}."""
 
@@ -49,7 +49,7 @@ class Schedule:
         return max(self.limits, key=self.limits.get)
 
 
-def simulate(stages: Sequence[StageCost], subjects: int, cores: int, memory_mb: float, start_s: float) -> Schedule:
+def simulate(stages: Sequence[MeasuredStage], subjects: int, cores: int, memory_mb: float, start_s: float) -> SimulatedSchedule:
     """So many subjects of these stages; each job books its share of the cores, as `limn run` gives it. start_s: of the
     workflow, once, and before each subject's first stage nothing more."""
     threads = max(1, cores // min(cores, subjects))
@@ -79,4 +79,4 @@ def simulate(stages: Sequence[StageCost], subjects: int, cores: int, memory_mb: 
         "memory": start_s + subjects * booked / memory_mb,
         "longest chain": start_s + rounds * chain,
     }
-    return Schedule(now, used / (cores * now), peak, limits)
+    return SimulatedSchedule(now, used / (cores * now), peak, limits)

@@ -30,7 +30,7 @@ from shared.io.arrays import read_json
 from tools.bench.marked import add_document, write_marked
 from tools.bench.profile import limn_run
 from tools.bench.runner import Bench, Entry, Table, markdown_table
-from tools.bench.schedule import StageCost, serial_share, simulate
+from tools.bench.schedule import MeasuredStage, serial_share, simulate
 
 PRESETS = ("draft", "standard")
 WHOLE = ""
@@ -114,7 +114,7 @@ def compared(rows: Sequence[Mapping], preset: str, cores: int, memory_mb: float)
     alone = {row["stage"]: row for row in own if row["subjects"] == 1}
     if not alone:
         return []
-    stages = [StageCost(name, row["cpu_s"], serial_share(row["wall_s"], row["cpu_s"], row["cores"]), row["booked_mb"])
+    stages = [MeasuredStage(name, row["cpu_s"], serial_share(row["wall_s"], row["cpu_s"], row["cores"]), row["booked_mb"])
               for name, row in alone.items() if name != WHOLE]  # fmt: skip
     chain = sum(row["wall_s"] for name, row in alone.items() if name != WHOLE)
     start_s = max(0.0, alone[WHOLE]["wall_s"] - chain)
