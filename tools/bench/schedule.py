@@ -49,7 +49,9 @@ class SimulatedSchedule:
         return max(self.limits, key=self.limits.get)
 
 
-def simulate(stages: Sequence[MeasuredStage], subjects: int, cores: int, memory_mb: float, start_s: float) -> SimulatedSchedule:
+def simulate(
+    stages: Sequence[MeasuredStage], subjects: int, cores: int, memory_mb: float, start_s: float
+) -> SimulatedSchedule:
     """So many subjects of these stages; each job books its share of the cores, as `limn run` gives it. start_s: of the
     workflow, once, and before each subject's first stage nothing more."""
     threads = max(1, cores // min(cores, subjects))

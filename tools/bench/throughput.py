@@ -114,7 +114,8 @@ def compared(rows: Sequence[Mapping], preset: str, cores: int, memory_mb: float)
     alone = {row["stage"]: row for row in own if row["subjects"] == 1}
     if not alone:
         return []
-    stages = [MeasuredStage(name, row["cpu_s"], serial_share(row["wall_s"], row["cpu_s"], row["cores"]), row["booked_mb"])
+    stages = [MeasuredStage(name, row["cpu_s"], serial_share(row["wall_s"], row["cpu_s"], row["cores"]),
+                            row["booked_mb"])
               for name, row in alone.items() if name != WHOLE]  # fmt: skip
     chain = sum(row["wall_s"] for name, row in alone.items() if name != WHOLE)
     start_s = max(0.0, alone[WHOLE]["wall_s"] - chain)
