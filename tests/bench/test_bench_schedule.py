@@ -3,7 +3,7 @@
 import pytest
 
 from tools.bench.schedule import MeasuredStage, serial_share, simulate
-from tools.bench.throughput import compared
+from tools.bench.throughput import around_stages, compared
 
 STAGES = [MeasuredStage("a", 10.0, 0.0, 100.0), MeasuredStage("b", 30.0, 0.5, 400.0)]
 
@@ -45,12 +45,21 @@ def test_no_schedule_beats_a_limit():
 
 
 def test_measured_and_simulated_stand_side_by_side():
-    alone = [{"preset": "draft", "subjects": 1, "cores": 2, "stage": "", "wall_s": 12.0, "cpu_s": 20.0},
+    alone = [{"preset": "draft", "subjects": 1, "cores": 2, "stage": "", "wall_s": 12.0, "cpu_s": 22.0},
              {"preset": "draft", "subjects": 1, "cores": 2, "stage": "a", "wall_s": 10.0, "cpu_s": 20.0,
               "booked_mb": 100.0}]  # fmt: skip
-    many = [{"preset": "draft", "subjects": 4, "cores": 1, "stage": "", "wall_s": 85.0, "cpu_s": 82.0}]
+    many = [{"preset": "draft", "subjects": 4, "cores": 1, "stage": "", "wall_s": 85.0, "cpu_s": 82.0},
+            {"preset": "draft", "subjects": 4, "cores": 1, "stage": "a", "wall_s": 20.0, "cpu_s": 20.0}]
     one, four, simulated = compared(alone + many, "draft", 16, 64000.0)
     assert one["measured, s"] == 12.0 == pytest.approx(one["simulated, s"])
     assert four["measured, s"] == 85.0 and four["simulated, s"] == pytest.approx(82.0)
     assert simulated["measured, s"] is None and simulated["simulated, s"] == pytest.approx(2.0 + 20.0 / 4)
     assert compared(many, "draft", 16, 64000.0) == [] == compared(alone, "standard", 16, 64000.0)
+
+
+def test_what_goes_on_around_the_stages_is_of_the_workflow_and_of_each_job():
+    """Three seconds once, two for each subject, shared by its two stages."""
+    rows = [{"subjects": count, "cores": cores, "stage": stage, "cpu_s": 3.0 + 12.0 * count if not stage else 5.0}
+            for count, cores in ((1, 2), (4, 1)) for stage in ("", "a", "b")]  # fmt: skip
+    assert around_stages(rows) == pytest.approx((3.0, 1.0))
+    assert around_stages(rows[:3]) == pytest.approx((5.0, 0.0))

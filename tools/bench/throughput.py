@@ -108,17 +108,36 @@ class ThroughputBench(Bench):
         return 0
 
 
+def around_stages(rows: Sequence[Mapping]) -> tuple[float, float]:
+    """Processor seconds beside the stages' own work, on one thread: of the workflow once, and of each job (its process,
+    its place in the workflow), from calls of one subject and of many. With one subject alone all counts once."""
+    own = {(row["subjects"], row["cores"]): 0.0 for row in rows}
+    for row in rows:
+        sign = 1.0 if row["stage"] == WHOLE else -row["subjects"]
+        own[row["subjects"], row["cores"]] += sign * row["cpu_s"]
+    single = next(seconds for (subjects, _), seconds in own.items() if subjects == 1)
+    many = [(subjects, seconds) for (subjects, cores), seconds in own.items() if subjects > 1 and cores == 1]
+    if not many:
+        return max(0.0, single), 0.0
+    jobs = len({row["stage"] for row in rows} - {WHOLE})
+    subjects, seconds = many[0]
+    each = min(max(0.0, (seconds - single) / (subjects - 1)), max(0.0, single))
+    return max(0.0, single - each), each / jobs
+
+
 def compared(rows: Sequence[Mapping], preset: str, cores: int, memory_mb: float) -> list[dict]:
     """A line per measured case of the preset and one for the simulated machine; none before the case of one subject."""
     own = [row for row in rows if row["preset"] == preset]
     alone = {row["stage"]: row for row in own if row["subjects"] == 1}
     if not alone:
         return []
-    stages = [MeasuredStage(name, row["cpu_s"], serial_share(row["wall_s"], row["cpu_s"], row["cores"]),
-                            row["booked_mb"])
-              for name, row in alone.items() if name != WHOLE]  # fmt: skip
-    chain = sum(row["wall_s"] for name, row in alone.items() if name != WHOLE)
-    start_s = max(0.0, alone[WHOLE]["wall_s"] - chain)
+    start_s, job_s = around_stages(own)
+    stages = []
+    for name, row in alone.items():
+        if name != WHOLE:
+            serial = serial_share(row["wall_s"], row["cpu_s"], row["cores"]) * row["cpu_s"] + job_s
+            cpu = row["cpu_s"] + job_s
+            stages.append(MeasuredStage(name, cpu, serial / cpu, row["booked_mb"]))
     measured = {(row["subjects"], row["cores"]): row["wall_s"] for row in own if row["stage"] == WHOLE}
     most = max(subjects for subjects, _ in measured)
     lines = []
