@@ -4,7 +4,7 @@
                                  [--preset NAME] [--document FILE]
 
 SUBJECT  a folder of numbered pictures frames/%04d.png, of at least as many frames as the longest case (default: a
-         synthetic head of 512 px, made once in DIR/subject; an hour on two cores for 500 frames).
+         synthetic head of 512 px, made once in DIR/subject).
 Does     `limn run` for each number of frames (every k-th picture of SUBJECT, so that the head turns as far in each),
          with the preset's maps; then for each edge of the maps with the fewest frames.
 Writes   OUT/growth.json and .csv: seconds, processor seconds and memory of each stage; OUT/growth.md: the same as
