@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shared.compute.compiled import compiled
+from shared.compute.compiled import compiled, compiled_part
 
 
 class Observations(NamedTuple):
@@ -28,7 +28,7 @@ class Observations(NamedTuple):
     loss: float
 
 
-@compiled
+@compiled_part
 def observe(observations, f, n, rows):
     """Writes the derivatives and the residual of observation f, n, whitened, to rows [2, 11] -> its Cauchy weight."""
     turn, moved, point = observations.rotation[f], observations.shift[f], observations.points[n]

@@ -262,7 +262,8 @@ def test_plan_and_run_see_other_models(case, monkeypatch, capsys):
 
 def test_stages_declare_the_models_that_they_load():
     """Only stages load models, and each names in its declaration all that its loaders read."""
-    loaders = {"load_face_networks": set(models.FACE_NETWORKS), "load_head_model": {models.HEAD_MODEL_FILE}}
+    loaders = {"load_face_networks": set(models.FACE_NETWORKS), "own_face_networks": set(models.FACE_NETWORKS),
+               "load_head_model": {models.HEAD_MODEL_FILE}}
     from shared.contract.pipeline import load_pipeline
 
     seen = set()

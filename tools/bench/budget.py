@@ -180,8 +180,8 @@ def _inverse(run: RunCounts) -> dict[str, Least]:
         found["fine normals"] = Least(memory=2 * seen, why="samples and shading of all seen texels read once")
     if solve.get("shape", {}).get("refined"):
         shaped = run.vertices * min(run.frames, own["shape_frames"] or run.frames)
-        found["shape equations"] = Least(memory=2 * shaped * CHANNELS * FLOAT * own["shape_rounds"],
-                                         why="samples and shading of all vertices, once a round")
+        found["shape equations"] = Least(memory=2 * shaped * CHANNELS * FLOAT * own["shape_steps"],
+                                         why="samples and shading of all vertices, once a step")
     return found
 
 

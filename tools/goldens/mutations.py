@@ -49,7 +49,7 @@ MUTATIONS = (
     Mutation("transfer function: exponent", "init_albedo", "shared/imaging/color.py", "0.055) / 1.055) ** 2.4)",
              "0.055) / 1.055) ** 2.52)", quick=True),
     Mutation("view weight: exponent", "init_albedo", "shared/imaging/image_sampling.py",
-             "np.where(seen, cosine**2, 0.0)", "np.where(seen, cosine**2.1, 0.0)"),
+             "np.where(shown, cosine**2, 0.0)", "np.where(shown, cosine**2.1, 0.0)"),
     Mutation("segments: seen weight", "init_albedo", "stages/init_albedo.py", "SEEN_WEIGHT = 0.5",
              "SEEN_WEIGHT = 0.525"),
     Mutation("BRDF: normal incidence", "inverse_render", "shared/rendering/brdf.py", "\nF0 = 0.04", "\nF0 = 0.042"),
