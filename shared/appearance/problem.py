@@ -31,11 +31,14 @@ from shared.appearance.observations import Capture
 from shared.appearance.sample_errors import SampleErrors
 from shared.appearance.skin_prior import SkinPrior, SkinVariation
 from shared.appearance.transport import Lobes, Transport
+from shared.compute.threads import share_out
 from shared.rendering.lobes import SpecularTransfer
 from shared.rendering.shading import Material
-from shared.rendering.transfer import nearest_points
+from shared.rendering.transfer import Transfer, nearest_points
 
 Value = TypeVar("Value")
+
+_POINTS_PER_BLOCK = 512
 
 
 @dataclass(frozen=True)
@@ -114,10 +117,46 @@ class _Latest:
 
 
 @dataclass(frozen=True, eq=False)
+class Bounces:
+    """What bounces between surfaces go by, widened once for all steps: from node to node [K, K], from each direction to
+    the nodes [K, J], from the nodes to the points [P, K]; float32."""
+
+    among_nodes: np.ndarray
+    to_nodes: np.ndarray
+    to_points: np.ndarray
+
+    @classmethod
+    def of(cls, points: Transfer, nodes: Transfer) -> Bounces:
+        """Those of the transfers of points and of nodes."""
+        return cls(*(table.astype(np.float32) for table in (nodes.bounce, nodes.direct, points.bounce)))
+
+    def take(self, index: slice | np.ndarray) -> Bounces:
+        """Those to some of the points."""
+        return replace(self, to_points=self.to_points[index])
+
+    def with_direct(self, direct: np.ndarray, albedo: np.ndarray) -> np.ndarray:
+        """[3, P, J]: irradiance from each direction, direct [P, J] and by all diffuse bounces between nodes of an
+        albedo [K, 3]: node_radiosity of all directions, channels and blocks of points shared out."""
+        among, identity = self.among_nodes, np.eye(len(self.among_nodes), dtype=np.float32)
+        own = albedo.T.astype(np.float32)[..., None]
+        radiosity = share_out(3, lambda c: np.linalg.solve(identity - own[c] * among, own[c] * self.to_nodes))
+        total = np.empty((3, *direct.shape), np.float32)
+        blocks = [(c, slice(first, first + _POINTS_PER_BLOCK))
+                  for c in range(3) for first in range(0, len(direct), _POINTS_PER_BLOCK)]
+
+        def add(k: int) -> None:
+            c, part = blocks[k]
+            np.add(self.to_points[part] @ radiosity[c], direct[part], out=total[c, part])
+
+        share_out(len(blocks), add)
+        return total
+
+
+@dataclass(frozen=True, eq=False)
 class AppearanceProblem:
     """What stays while states change: the capture, settings, the samples' errors as assumed, the points' lobes as a
-    function of the roughness, the point that each node takes its albedo from [K], the prior on skin, or None, and the
-    irradiance from each direction, without bounces [P, J]."""
+    function of the roughness, the point that each node takes its albedo from [K], the prior on skin, or None, the
+    irradiance from each direction, without bounces [P, J], and what bounces go by."""
 
     capture: Capture
     settings: AppearanceSettings
@@ -126,6 +165,7 @@ class AppearanceProblem:
     node_to_point: np.ndarray
     skin_prior: SkinPrior | None
     direct: torch.Tensor
+    bounces: Bounces
     _latest_lobes: _Latest = field(default_factory=_Latest, repr=False)
     _latest_frame_light: _Latest = field(default_factory=_Latest, repr=False)
 
@@ -144,6 +184,7 @@ class AppearanceProblem:
             node_to_point=nearest_points(capture.nodes.points, capture.points),
             skin_prior=skin_prior,
             direct=torch.from_numpy(capture.transfer.direct.astype(np.float32)),
+            bounces=Bounces.of(capture.transfer, capture.node_transfer),
         )
 
     def take(self, index: slice | np.ndarray) -> AppearanceProblem:
@@ -151,7 +192,7 @@ class AppearanceProblem:
         capture = self.capture.take(index)
         table = SpecularTransfer(capture.points.normals, capture.transfer.visibility(), capture.directions)
         return AppearanceProblem(capture, self.settings, self.errors.take(index), table, self.node_to_point,
-                                 self.skin_prior, self.direct[index])
+                                 self.skin_prior, self.direct[index], self.bounces.take(index))
 
     # ------------------------------------------------------------------ states
     def uniform_start(self) -> AppearanceState:
@@ -206,12 +247,7 @@ class AppearanceProblem:
         if not self.settings.bounce:
             return self.direct[None].expand(3, -1, -1)
         share = Material(state.node_albedo, state.specular, state.roughness).bounce_albedo()
-        # node_radiosity @ direct, without the matrix in between
-        form, node_direct, bounce = (table.astype(np.float32) for table in (
-            self.capture.node_transfer.bounce, self.capture.node_transfer.direct, self.capture.transfer.bounce))
-        albedo = share.T.astype(np.float32)[..., None]
-        radiosity = np.linalg.solve(np.eye(len(form), dtype=np.float32) - albedo * form, albedo * node_direct)
-        return self.direct + torch.from_numpy(bounce @ radiosity)
+        return torch.from_numpy(self.bounces.with_direct(self.direct.numpy(), share))
 
     def lobes_at(self, roughness: float) -> Lobes:
         """The points' lobes at a roughness."""

@@ -25,8 +25,16 @@ def per_channel_transposed(table: torch.Tensor, values: torch.Tensor) -> torch.T
 
 
 def _multiply(left: np.ndarray, right: np.ndarray) -> torch.Tensor:
-    result = np.empty((len(left), left.shape[1], right.shape[2]), np.float32)
-    share_out(len(left), lambda c: np.matmul(left[c], right[c], out=result[c]))
+    """[N, R, K] times [N, K, F]: half of a channel at a time, which shares out evenly among two and three threads."""
+    rows = left.shape[1]
+    halves = [(c, part) for c in range(len(left)) for part in (slice(0, rows // 2), slice(rows // 2, rows))]
+    result = np.empty((len(left), rows, right.shape[2]), np.float32)
+
+    def multiply(k: int) -> None:
+        c, part = halves[k]
+        np.matmul(left[c, part], right[c], out=result[c, part])
+
+    share_out(len(halves), multiply)
     return torch.from_numpy(result)
 
 
