@@ -15,14 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
-import torch
 from scipy.spatial import cKDTree
 
 from shared.compute.threads import share_out
 from shared.geometry.mesh import normalised, tangent_frames
 from shared.rendering.lobes import specular_reflection
 from shared.rendering.shading import VertexShading
-from shared.rendering.transfer import Points, position_and_normal, spread_vertices
+from shared.rendering.transfer import Points, Transfer, position_and_normal, spread_vertices
 
 NORMAL_STEP = 0.06
 """Radians between the normals whose reflections are differenced: half the spacing of 768 directions."""
@@ -50,19 +49,19 @@ class ShadingTerms:
         return ShadingTerms(*(array[index] for array in arrays), self.shadow_slope[index])
 
 
-class IrradianceVectors:
-    """W of P points: visible [P, J] bool, directions [J, 3], light_along [J, F, 3]."""
+def irradiance_vectors(transfer: Transfer, rows: np.ndarray, directions: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """W [n, F, 3 channels, 3] float32 of some of the transfer's points, rows [n] int; directions [J, 3], light along
+    them [J, F, 3]."""
+    spread = np.float32(4.0 / len(directions)) * directions.astype(np.float32)
+    moments = (light[..., None] * spread[:, None, None]).reshape(len(light), -1)
+    result = np.empty((len(rows), moments.shape[1]), np.float32)
 
-    def __init__(self, visible: np.ndarray, directions: np.ndarray, light_along: np.ndarray):
-        self.visible = torch.from_numpy(visible.astype(np.float32))
-        self.directions, self.light_along = directions.astype(np.float32), light_along
+    def fill(k: int) -> None:
+        part = slice(k * _POINTS_PER_BLOCK, (k + 1) * _POINTS_PER_BLOCK)
+        np.matmul(transfer.visibility(rows[part]).astype(np.float32), moments, out=result[part])
 
-    def frames(self, frames: slice) -> np.ndarray:
-        """[P, n, 3 channels, 3] float32 in n of the frames."""
-        light = self.light_along[:, frames]
-        moments = light[..., None] * self.directions[:, None, None] * np.float32(4.0 / len(self.directions))
-        result = self.visible @ torch.from_numpy(moments.reshape(len(light), -1))
-        return result.numpy().reshape(len(self.visible), light.shape[1], 3, 3)
+    share_out(-(-len(rows) // _POINTS_PER_BLOCK), fill)
+    return result.reshape(len(rows), light.shape[1], 3, 3)
 
 
 class Reflections:
@@ -122,8 +121,7 @@ def shading_terms(shading: VertexShading, rows: np.ndarray, reflections: Reflect
     """
     normals = shading.points.normals[rows]
     tangents = tangent_frames(normals).astype(np.float32)
-    vectors = IrradianceVectors(shading.transfer.visibility(rows), shading.directions, shading.light_along)
-    along = vectors.frames(slice(None))
+    along = irradiance_vectors(shading.transfer, rows, shading.directions, shading.light_along)
     shape = (len(rows), shading.light_along.shape[1], 3)
     turn = (along.reshape(len(rows), -1, 3) @ tangents.transpose(0, 2, 1)).reshape(shape + (2,))
     shadow = shadow_slope(shading.points.take(rows), along)

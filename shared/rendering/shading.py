@@ -84,12 +84,21 @@ class VertexShading:
         light_index: np.ndarray | None = None,
     ):
         self.material, self.directions = material, directions
-        self.points, self.transfer = points, transfer
-        self.table = SpecularTransfer(points.normals, transfer.visibility(), directions)
-        self._vertices, self._index, self._deep = vertices, index, deep
+        self._deep, self._key_step = deep, key_step
         self._nodes = node_transfer if bounce else None
-        self._key_step = key_step
+        self._place(index, vertices, points, transfer)
         self._light(light, camera_from_head, moves, light_index)
+
+    def of_points(
+        self, index: np.ndarray, vertices: np.ndarray, points: Points, transfer: Transfer, material: Material
+    ) -> VertexShading:
+        """Other points of the same head, whose nodes and their albedo are the same, under the same light in the same
+        frames; the arguments are those of the class."""
+        other = copy(self)
+        other.material = material
+        other._place(index, vertices, points, transfer)
+        other._receive()
+        return other
 
     def under(
         self, light: np.ndarray, camera_from_head: np.ndarray, moves: str, light_index: np.ndarray | None = None
@@ -99,20 +108,27 @@ class VertexShading:
         other._light(light, camera_from_head, moves, light_index)
         return other
 
+    def _place(self, index, vertices, points, transfer) -> None:
+        self._vertices, self._index, self.points, self.transfer = vertices, index, points, transfer
+        self.table = SpecularTransfer(points.normals, transfer.visibility(), self.directions)
+        self.__dict__.pop("stand_in", None)
+
     def _light(self, light, camera_from_head, moves, light_index) -> None:
         self.light_along = light_along(light, self.directions, world_from_head(camera_from_head, moves), light_index)
-        shape = (len(self.points), len(camera_from_head), 3)
-        direct = irradiance(self.transfer, self.light_along.reshape(len(self.directions), -1))
-        bounces = self._nodes is not None
-        bounced = bounced_irradiance(self.transfer, self._sent_by_nodes()) if bounces else np.zeros_like(direct)
-        total = direct + bounced
-        self._irradiance = total.reshape(shape).astype(np.float16)
-        self._bounced = (total - direct).reshape(shape).astype(np.float16)
+        self._node_light = None if self._nodes is None else self._sent_by_nodes()
         self._centres = camera_centres(camera_from_head)
         self._turn = turned_so_far(camera_from_head)
         if light_index is not None:  # so that no frame lies between key frames of two lights
             self._turn += 2.0 * np.pi * light_index
         self._keys = key_frames(self._turn, self._key_step)
+        self._receive()
+
+    def _receive(self) -> None:
+        shape = (len(self.points), *self.light_along.shape[1:])
+        direct = irradiance(self.transfer, self.light_along.reshape(len(self.directions), -1))
+        total = direct if self._node_light is None else direct + bounced_irradiance(self.transfer, self._node_light)
+        self._irradiance = total.reshape(shape).astype(np.float16)
+        self._bounced = (total - direct).reshape(shape).astype(np.float16)
         self._key_reflection: dict[int, np.ndarray] = {}
         self._key_uncertainty: np.ndarray | None = None
 

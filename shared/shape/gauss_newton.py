@@ -150,6 +150,7 @@ class ShapeSolver:
     ):
         self.views, self.tracks, self.reflectance = views, tracks, reflectance
         self.appearance, self.sizes, self.settings, self.context = appearance, sizes, settings, context
+        self._shading: VertexShading | None = None
 
     def trace(self, mesh: Mesh, shaped: np.ndarray, before: Traced | None = None) -> Traced:
         """Looks at the shaped faces' vertices that some frame faces. before: of a coarser level, whose nearest point
@@ -204,20 +205,22 @@ class ShapeSolver:
         known, precomputed = self.reflectance, traced.precomputed
         local = None if known.local_roughness_fit is None else known.local_roughness_fit.roughness(points.positions)
         node_albedo = known.node_albedo[nearest_points(precomputed.nodes.points, known.nodes.points)]
-        return VertexShading(
-            traced.index,
-            mesh.vertices,
-            points,
-            transfer,
-            precomputed.node_transfer,
-            Material(node_albedo, known.specular, known.roughness, local),
-            known.light,
-            precomputed.directions,
-            self.views.camera_from_head,
-            self.appearance.light_moves(self.views.moves),
-            bounce=self.appearance.bounce,
-            light_index=self.views.light_index,
-        )
+        material = Material(node_albedo, known.specular, known.roughness, local)
+        place = traced.index, mesh.vertices, points, transfer
+        if self._shading is None:  # all levels and steps have its light and its nodes
+            self._shading = VertexShading(
+                *place,
+                precomputed.node_transfer,
+                material,
+                known.light,
+                precomputed.directions,
+                self.views.camera_from_head,
+                self.appearance.light_moves(self.views.moves),
+                bounce=self.appearance.bounce,
+                light_index=self.views.light_index,
+            )
+            return self._shading
+        return self._shading.of_points(*place, material)
 
     def step(self, surface: ShapedSurface, start: np.ndarray, shaped: np.ndarray, held: np.ndarray) -> np.ndarray:
         """Offsets [V] along the normals. start [V, 3] mm: vertices of the level's first mesh; shaped [F] bool: the
