@@ -9,11 +9,14 @@ from pathlib import Path
 
 import numba
 from numba.core.dispatcher import Dispatcher
+from numba.core.registry import cpu_target
 
 from shared.compute.kept_code import VARIABLE, KeptCode
 
 _OPTIONS = {"nogil": True, "error_model": "numpy",
             "fastmath": {"nnan", "ninf", "nsz", "reassoc", "contract", "arcp"}}
+cpu_target.typing_context.refresh()  # as the first call of a loop does: a tenth of a second, spent with the imports
+cpu_target.target_context.refresh()
 
 
 def compiled(loop: Callable) -> Callable:

@@ -187,4 +187,9 @@ def _hash_of(content: bytes) -> str:
 def _own_sources(file: str) -> tuple[str, ...]:
     """Hashes of the library's sources, and of the file that the loop is in where that lies elsewhere."""
     source = Path(file)
-    return (hash_of_sources(_LIBRARY), "" if source.is_relative_to(_LIBRARY) else _hash_of(source.read_bytes()))
+    return (_hash_of_library(), "" if source.is_relative_to(_LIBRARY) else _hash_of(source.read_bytes()))
+
+
+@cache
+def _hash_of_library() -> str:
+    return hash_of_sources(_LIBRARY)

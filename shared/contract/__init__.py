@@ -6,7 +6,7 @@ are used): a stage whose result is current then answers at once.
 
 Read in this order: wording, declare, records, shapes, chart_place, confine, subject, models, hashing,
 manifest, folders, needs, source, pipeline, progress, job, currency, drift, machine, provenance, sums, disk, limits,
-cache_folder, interpreter, request, execute, cli, launch.
+cache_folder, interpreter, request, execute, cli, launch, fork_server, fork_client.
 May import: errors.
 """
 

@@ -32,6 +32,11 @@ def settled_environment(threads: int) -> dict[str, str]:
             "OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "PASSIVE")}
 
 
+def prepare(threads: int) -> None:
+    """Brings a process into that state before it has loaded any library, with loops kept where the operator says."""
+    os.environ.update({VARIABLE: cache_folder(), **settled_environment(threads)})
+
+
 def settle(threads: int) -> None:
     """Brings the process into that state. To be called before the stage works.
 

@@ -51,6 +51,11 @@ def earlier_verdict(events: Path | None) -> int | None:
     return {"input_error": 2, "failed": 1}.get(kind)
 
 
+def search_path(root: str) -> list[str]:
+    """Where the stages of a pipeline in that folder look for modules first."""
+    return [root, str(REPOSITORY)]
+
+
 def main() -> int:
     """0 where the stage is current, 2 where the input is at fault; otherwise what the stage says."""
     tie_to_parent()
@@ -71,7 +76,7 @@ def main() -> int:
     except InputError as error:
         report_input_error(name, error, request.events)
         return 2
-    search = [folder, str(REPOSITORY)]
+    search = search_path(folder)
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [*search, os.environ.get("PYTHONPATH", "")]))
     sys.path[:0] = search
     sys.argv[1:] = arguments

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 
 from shared.contract.machine import kernels, processor
@@ -74,14 +75,20 @@ def own_peak_bytes() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
+@cache
+def installed_packages() -> tuple[tuple[str, str, frozenset[str]], ...]:
+    """(name, version, its top modules) of each installed package, as this process found them."""
+    found = []
+    for distribution in metadata.distributions():
+        tops = (distribution.read_text("top_level.txt") or "").split() or [distribution.name.replace("-", "_")]
+        found.append((distribution.name, distribution.version, frozenset(top.partition("/")[0] for top in tops)))
+    return tuple(found)
+
+
 def environment() -> dict[str, object]:
     """Host, platform, processor, kernels chosen for it, Python, versions of the loaded packages, command line."""
     loaded = {name.partition(".")[0] for name in sys.modules}
-    packages = {}
-    for distribution in metadata.distributions():
-        tops = (distribution.read_text("top_level.txt") or "").split() or [distribution.name.replace("-", "_")]
-        if loaded & {top.partition("/")[0] for top in tops}:
-            packages[distribution.name] = distribution.version
+    packages = {name: version for name, version, tops in installed_packages() if not loaded.isdisjoint(tops)}
     return {
         "host": platform.node(),
         "platform": platform.platform(),

@@ -13,6 +13,7 @@ import os
 import sys
 import sysconfig
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from types import CodeType
 
@@ -86,7 +87,12 @@ def fingerprint(path: Path) -> str:
     """
     if path.suffix != ".py":
         return hashlib.sha256(path.read_bytes()).hexdigest()
-    code = compile(path.read_bytes(), "", "exec", dont_inherit=True, optimize=2)
+    return _fingerprint_of(path.read_bytes())
+
+
+@cache
+def _fingerprint_of(source: bytes) -> str:
+    code = compile(source, "", "exec", dont_inherit=True, optimize=2)
     return hashlib.sha256(marshal.dumps(_without_lines(code), 2)).hexdigest()  # 2: the last without shared references
 
 

@@ -14,12 +14,15 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from shared.contract import fork_client, fork_server, launch
 from shared.contract.cache_folder import VARIABLE, cache_folder
 from shared.contract.folders import RunFolder
+from shared.contract.fork_server import Served
 from shared.contract.manifest import write_record
 from shared.contract.needs import scale_of
 from shared.contract.pipeline import REPOSITORY, Pipeline
@@ -28,7 +31,7 @@ from tools.cli.resources import KINDS
 from tools.cli.watch import Track, Watch
 
 SCRATCH = ".workflow-"
-EVENTS = "events"
+EVENTS, SERVERS = "events", "servers"
 _POLL_S, _TRACKS_PER_S = 0.2, 1000
 _SET_PARENT_DEATH_SIGNAL = 1
 _CLUSTER_THREADS = 4
@@ -66,7 +69,7 @@ class EngineSettings:
 def scratch_folder(run: RunFolder) -> Iterator[Path]:
     """A folder in work/ for the engine's state and the events of the subject's stages, removed in the end."""
     path = run.work / f"{SCRATCH}{os.getpid()}"
-    for name in (EVENTS, "runs", "tmp"):
+    for name in (EVENTS, SERVERS, "runs", "tmp"):
         (path / name).mkdir(parents=True)
     try:
         yield path
@@ -120,8 +123,9 @@ def _configure_case(
 def _command(name: str, case: SubjectCase, settings: EngineSettings, events: Path) -> str:
     """The shell command of one stage."""
     pipeline = settings.pipeline
-    command = [sys.executable, "-m", "shared.contract.launch", str(pipeline.root), pipeline.package, name,
-               "--subject", str(case.subject.folder), "--pipeline", str(pipeline.path), "--events", str(events)]
+    start = ["-m", launch.__name__] if settings.profile else ["-I", "-S", fork_client.__file__, f"{SERVERS}/{name}"]
+    command = [sys.executable, *start, str(pipeline.root), pipeline.package, name, "--subject",
+               str(case.subject.folder), "--pipeline", str(pipeline.path), "--events", str(events)]
     if case.clip:
         command += ["--clip", case.clip]
     if settings.out:
@@ -129,9 +133,10 @@ def _command(name: str, case: SubjectCase, settings: EngineSettings, events: Pat
     return shlex.join([*command, *settings.arguments[name]])
 
 
-def run_engine(home: Path, settings: EngineSettings, watch: Watch, log: Path) -> bool:
+def run_engine(home: Path, cases: Sequence[SubjectCase], settings: EngineSettings, watch: Watch, log: Path) -> bool:
     """Runs Snakemake to its end and shows the stages' events; False where the user interrupted it."""
     process = _start(home, settings, log)
+    server = None if settings.profile else _start_server(home, cases, settings, log)
     pause = _POLL_S + len(watch.tracks) / _TRACKS_PER_S
     try:
         while not _has_ended(process, pause):
@@ -143,9 +148,10 @@ def run_engine(home: Path, settings: EngineSettings, watch: Watch, log: Path) ->
             _cancel_jobs(process)
         return False
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+        for started in filter(None, (process, server)):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(started.pid, signal.SIGKILL)
+            started.wait()
 
 
 def _has_ended(process: subprocess.Popen, wait_s: float) -> bool:
@@ -167,10 +173,25 @@ def _start(home: Path, settings: EngineSettings, log: Path) -> subprocess.Popen:
         command += ["--resources", f"mem_mb={settings.memory_mb}"]
     if settings.profile:
         command += ["--profile", profile_folder(settings.profile)]
-    environment = engine_environment(home)
-    with open(log, "wb") as file:
+    return _process(command, home, log)
+
+
+def _start_server(home: Path, cases: Sequence[SubjectCase], settings: EngineSettings, log: Path) -> subprocess.Popen:
+    """The process of which stages on this machine are forked, see shared/contract/fork_server.py."""
+    pipeline = settings.pipeline
+    jobs = Counter(name for case in cases for part, name in case.jobs(pipeline) if not part.run.stamp(name).exists())
+    stages = [str(Served(name, settings.threads_of(name, len(cases)), jobs[name]))
+              for name in pipeline.steps if jobs[name]]
+    return _process([sys.executable, "-m", fork_server.__name__, str(home / SERVERS), str(pipeline.root),
+                     pipeline.package, *stages], home, log)
+
+
+def _process(command: Sequence[str], home: Path, log: Path) -> subprocess.Popen:
+    """A process of the engine, in a process group of its own that dies with this process; it adds to the log."""
+    with open(log, "ab") as file:
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
-                                env=environment, cwd=home, start_new_session=True, preexec_fn=_die_with_parent)
+                                env=engine_environment(home), cwd=home, start_new_session=True,
+                                preexec_fn=_die_with_parent)
 
 
 def engine_environment(home: Path) -> dict[str, str]:

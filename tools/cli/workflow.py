@@ -140,7 +140,7 @@ def _run_waiting(cases: Sequence[SubjectCase], settings: EngineSettings, start: 
         tracks = configure(scratches, cases, settings)
         watch, log = Watch([track for own in tracks for track in own]), scratches[0] / _WORKFLOW_LOG
         try:
-            interrupted = not run_engine(scratches[0], settings, watch, log)
+            interrupted = not run_engine(scratches[0], cases, settings, watch, log)
         finally:
             watch.close()
             if settings.profile:
