@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -133,14 +133,21 @@ def _command(name: str, case: SubjectCase, settings: EngineSettings, events: Pat
     return shlex.join([*command, *settings.arguments[name]])
 
 
-def run_engine(home: Path, cases: Sequence[SubjectCase], settings: EngineSettings, watch: Watch, log: Path) -> bool:
-    """Runs Snakemake to its end and shows the stages' events; False where the user interrupted it."""
+def run_engine(home: Path, cases: Sequence[SubjectCase], settings: EngineSettings, watch: Watch, log: Path,
+               meanwhile: Callable[[], object]) -> bool:
+    """Runs Snakemake to its end and shows the stages' events; False where the user interrupted it.
+
+    meanwhile: is called once a stage works.
+    """
     process = _start(home, settings, log)
     server = None if settings.profile else _start_server(home, cases, settings, log)
-    pause = _POLL_S + len(watch.tracks) / _TRACKS_PER_S
+    pause, is_called = _POLL_S + len(watch.tracks) / _TRACKS_PER_S, False
     try:
         while not _has_ended(process, pause):
             watch.poll()
+            if not is_called and watch.has_begun:
+                is_called = True
+                meanwhile()
         watch.poll()
         return True
     except KeyboardInterrupt:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -55,6 +56,11 @@ def write_overview(path: Path, outcomes: Sequence[Outcome], pipeline: Pipeline) 
         temporary.unlink(missing_ok=True)
         raise InputError("the overview cannot be written", where=str(path), got=error.strerror,
                          hint="choose another place") from error
+
+
+def load_pictures() -> None:
+    """Loads what the pictures of the page need, which otherwise happens when the first is written."""
+    importlib.import_module("tools.cli.thumbnails")
 
 
 def page_beside(summary: Path) -> Path:

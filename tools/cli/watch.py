@@ -91,6 +91,11 @@ class Watch:
         self._terminal = sys.stderr.isatty()
         self._width = max((len(f"{t.subject}  {t.stage}") for t in self.tracks), default=0)
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether any stage has told anything."""
+        return any(track.state != "waiting" for track in self.tracks)
+
     def poll(self) -> None:
         """Shows what is new."""
         for track in self.tracks:

@@ -26,7 +26,7 @@ from tools.cli.cases import InputErrors, Opened, SubjectCase, no_access, one_lin
 from tools.cli.cluster import keep_slurm_logs
 from tools.cli.engine import SCRATCH, EngineSettings, configure, run_engine, scratch_folder
 from tools.cli.outcome import Outcome, at_fault, exit_code, outcome_of, write_summary
-from tools.cli.overview import page_beside, write_overview
+from tools.cli.overview import load_pictures, page_beside, write_overview
 from tools.cli.plan import CURRENT, StagePlan, kept_lines, plan_case
 from tools.cli.summary import table_lines
 from tools.cli.watch import Track, Watch
@@ -140,14 +140,14 @@ def _run_waiting(cases: Sequence[SubjectCase], settings: EngineSettings, start: 
         tracks = configure(scratches, cases, settings)
         watch, log = Watch([track for own in tracks for track in own]), scratches[0] / _WORKFLOW_LOG
         try:
-            interrupted = not run_engine(scratches[0], cases, settings, watch, log)
+            interrupted = not run_engine(scratches[0], cases, settings, watch, log, load_pictures)
         finally:
             watch.close()
             if settings.profile:
                 keep_slurm_logs(scratches[0])
         for case in cases:
             clear_all_leftovers(case, settings.pipeline, keep_logs=not interrupted)
-        if not interrupted and all(track.state == "waiting" for track in watch.tracks):
+        if not interrupted and not watch.has_begun:
             for line in log.read_text(encoding="utf-8", errors="replace").splitlines()[-20:]:
                 _say(f"| {line}")
         return {case.name: _guarded(case, partial(_conclude, case, own, settings, log, time.monotonic() - start,
