@@ -8,7 +8,7 @@ Then it listens at FOLDER/STAGE and forks a child for each job that shared/contr
 takes over the job's environment, folder and output and goes on as shared/contract/launch.py. It has one thread and
 memory of its own: a stage that dies takes nothing with it.
 
-All processes but the first stage's load at low priority, one after another. They end with their JOBS, and the kernel
+They load at low priority, one after another, but at once where a job waits. They end with their JOBS, and the kernel
 ends them, and their stages, with the process that started them.
 """
 
@@ -19,6 +19,7 @@ import contextlib
 import gc
 import json
 import os
+import select
 import selectors
 import signal
 import socket
@@ -26,8 +27,9 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
@@ -36,7 +38,7 @@ from shared.contract.interpreter import leave, prepare
 from shared.contract.provenance import installed_packages
 from shared.contract.source import loaded_code
 
-_LOW_PRIORITY = 10
+_LOW_PRIORITY = 5
 _CHUNK = 1 << 16
 _LOOKS, _LOOK_S = 200, 0.005
 
@@ -62,31 +64,39 @@ class Served:
 def main() -> int:
     """Serves until all jobs are done; 0."""
     folder, root, package, *texts = sys.argv[1:]
-    stages = [Served.of(text) for text in texts]
-    listeners = [_listener(Path(folder), stage.name) for stage in stages]
-    for number, (stage, listener) in enumerate(zip(stages, listeners, strict=True)):
+    waiting = [(stage, _listener(Path(folder), stage.name)) for stage in map(Served.of, texts)]
+    loading: list[int] = []  # one that loads ahead: it closes its end of a pipe when it has
+    while waiting:
+        asked, _, _ = select.select([*loading, *(listener for _, listener in waiting)], [], [], None if loading else 0)
+        urgent = next((pair for pair in waiting if pair[1] in asked), None)
+        if urgent is None and loading:
+            os.close(loading.pop())
+        stage, listener = urgent or waiting[0]
+        waiting.remove((stage, listener))
         ready, tell = os.pipe()
         if os.fork() == 0:
-            os.close(ready)
-            for other in listeners[number + 1:]:
+            for descriptor in (ready, *loading):
+                os.close(descriptor)
+            for _, other in waiting:
                 other.close()
-            _serve_and_end(stage, listener, tell, root, package, number == 0)
+            _serve_and_end(stage, listener, tell, root, package)
         os.close(tell)
         listener.close()
-        os.read(ready, 1)  # nothing, once it is closed
-        os.close(ready)
+        if urgent is None:
+            loading.append(ready)
+        else:
+            os.close(ready)
     with contextlib.suppress(ChildProcessError):
         while True:
             os.wait()
     return 0
 
 
-def _serve_and_end(stage: Served, listener: socket.socket, tell: int, root: str, package: str,
-                   urgent: bool) -> NoReturn:
+def _serve_and_end(stage: Served, listener: socket.socket, tell: int, root: str, package: str) -> NoReturn:
     """Never comes back: the stack of a forked process is its parent's."""
     code = 1
     try:
-        _serve_stage(stage, listener, tell, root, package, urgent)
+        _serve_stage(stage, listener, tell, root, package)
         code = 0
     except Exception as error:
         sys.stderr.write(f"{stage.name}: not loaded ahead: {type(error).__name__}: {error}\n")
@@ -108,16 +118,15 @@ def _listener(folder: Path, name: str) -> socket.socket:
     return listener
 
 
-def _serve_stage(stage: Served, listener: socket.socket, tell: int, root: str, package: str, urgent: bool) -> None:
+def _serve_stage(stage: Served, listener: socket.socket, tell: int, root: str, package: str) -> None:
     """Loads, says that it has, serves the jobs."""
     launch.tie_to_parent()
     prepare(stage.threads)
     sys.path[:0] = launch.search_path(root)
-    path = Path(root).joinpath(*package.split("."), f"{stage.name}.py")
-    if urgent:
-        load(path, root)
-    else:
-        _at_low_priority(path, root)
+    steps = steps_to_load(Path(root).joinpath(*package.split("."), f"{stage.name}.py"), Path(root))
+    _do_at_low_priority(steps, listener)
+    for step in steps:  # those that are left
+        step()
     if not _is_alone():
         raise RuntimeError("its imports started threads, which a fork would lack")
     gc.collect()
@@ -126,20 +135,32 @@ def _serve_stage(stage: Served, listener: socket.socket, tell: int, root: str, p
     _Children(stage, listener).serve()
 
 
-def _at_low_priority(path: Path, root: str) -> None:
-    """A thread loads, since a process cannot take its priority back."""
-    errors: list[Exception] = []
+def _do_at_low_priority(steps: Iterator[Callable[[], object]], listener: socket.socket) -> None:
+    """Does one step after another, until all are done or somebody waits at the listener.
+
+    In a thread, since a process cannot take its priority back.
+    """
+    if select.select([listener], [], [], 0)[0]:
+        return
+    wanted, errors = threading.Event(), []
+    done, tell = os.pipe()
 
     def work() -> None:
         try:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LOW_PRIORITY)
-            load(path, root)
+            while not wanted.is_set() and (step := next(steps, None)) is not None:
+                step()
         except Exception as error:
             errors.append(error)
+        finally:
+            os.close(tell)
 
-    loader = threading.Thread(target=work)
-    loader.start()
-    loader.join()
+    worker = threading.Thread(target=work)
+    worker.start()
+    select.select([listener, done], [], [])
+    wanted.set()
+    worker.join()
+    os.close(done)
     if errors:
         raise errors[0]
 
@@ -153,13 +174,13 @@ def _is_alone() -> bool:
     return False
 
 
-def load(path: Path, root: str) -> None:
-    """Executes the imports that every run of a stage file begins with, and looks up what its record will say of them.
-    """
+def steps_to_load(path: Path, root: Path) -> Iterator[Callable[[], object]]:
+    """Executes the imports that every run of a stage file begins with, and looks up what its record will say of them,
+    step by step."""
     for node in first_imports(path):
-        exec(compile(ast.Module([node], type_ignores=[]), str(path), "exec"), {})
-    loaded_code((Path(root),))
-    installed_packages()
+        yield partial(exec, compile(ast.Module([node], type_ignores=[]), str(path), "exec"), {})
+    yield partial(loaded_code, (root,))
+    yield installed_packages
 
 
 def first_imports(path: Path) -> list[ast.Import | ast.ImportFrom]:
