@@ -121,6 +121,8 @@ def _listener(folder: Path, name: str) -> socket.socket:
 def _serve_stage(stage: Served, listener: socket.socket, tell: int, root: str, package: str) -> None:
     """Loads, says that it has, serves the jobs."""
     launch.tie_to_parent()
+    with contextlib.suppress(OSError):
+        Path("/proc/self/comm").write_text(stage.name)  # what ps and top call it, and its forks; cut to 15 letters
     prepare(stage.threads)
     sys.path[:0] = launch.search_path(root)
     steps = steps_to_load(Path(root).joinpath(*package.split("."), f"{stage.name}.py"), Path(root))

@@ -154,6 +154,7 @@ def test_a_stage_dies_with_those_above_it(pipeline, anna, environment, victim):
     family = {pid: " ".join(words_of(pid)) for pid in processes_below(process.pid)}
     clients = [pid for pid, words in family.items() if words.split()[1:3] == ["-I", "-S"]]
     engines = [pid for pid, words in family.items() if "snakemake_process" in words]
+    assert Path(f"/proc/{stage}/comm").read_text() == "first\n"
     assert "fork_server" in family[server] and stage in family and len(clients) == len(engines) == 1
     os.kill({"limn": process.pid, "server": server, "client": clients[0], "engine": engines[0]}[victim], signal.SIGKILL)
     output, _ = process.communicate(timeout=120)

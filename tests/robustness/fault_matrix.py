@@ -34,6 +34,7 @@ from quick import SETTINGS, TINY  # noqa: E402
 from toy_runs import copy_pipeline, make_subject  # noqa: E402
 
 from shared.contract.declare import folder_of  # noqa: E402
+from shared.contract.folders import RunFolder  # noqa: E402
 from shared.contract.hashing import HashMemory  # noqa: E402
 from shared.contract.interpreter import settled_environment  # noqa: E402
 from shared.contract.manifest import damage, read_manifest  # noqa: E402
@@ -235,7 +236,7 @@ def kill(bench: Bench, out: Path, number: int) -> list[str]:
     began = bench.wait_for_stage(process, out, stage)
     time.sleep(bench.rng.uniform(0, 1.2) * bench.stage_seconds[stage])
     group = family(process.pid)
-    stages = [pid for pid in group if f"stages.{stage}" in command_line(pid) or f"toy.{stage}" in command_line(pid)]
+    stages = [pid for pid in group if RunFolder(out / "anna").temporary_of(stage, pid).exists()]
     for pid in {"limn": [process.pid], "stage": stages, "all": group}[victim]:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -384,14 +385,6 @@ def family(pid: int) -> list[int]:
         process = psutil.Process(pid)
         return [pid, *(child.pid for child in process.children(recursive=True))]
     return [pid]
-
-
-def command_line(pid: int) -> str:
-    """'' where the process is gone."""
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
-    except OSError:
-        return ""
 
 
 def alive(pid: int) -> bool:
