@@ -21,7 +21,6 @@ import argparse
 import json
 import os
 import sys
-import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -205,6 +204,8 @@ def status_command(args: argparse.Namespace) -> int:
 
 def report_command(args: argparse.Namespace) -> int:
     """limn report"""
+    import webbrowser
+
     def show(case, plans) -> None:
         path, remarks = report_path(case, plans)
         for remark in remarks:
