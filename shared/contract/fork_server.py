@@ -30,6 +30,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
 
@@ -121,12 +122,13 @@ def _listener(folder: Path, name: str) -> socket.socket:
 def _serve_stage(stage: Served, listener: socket.socket, tell: int, root: str, package: str) -> None:
     """Loads, says that it has, serves the jobs."""
     launch.tie_to_parent()
+    os.close(os.pidfd_open(os.getpid()))  # no stage is taken where its end could not be watched
     with contextlib.suppress(OSError):
         Path("/proc/self/comm").write_text(stage.name)  # what ps and top call it, and its forks; cut to 15 letters
     prepare(stage.threads)
     sys.path[:0] = launch.search_path(root)
     steps = steps_to_load(Path(root).joinpath(*package.split("."), f"{stage.name}.py"), Path(root))
-    _do_at_low_priority(steps, listener)
+    do_at_low_priority(steps, listener)
     for step in steps:  # those that are left
         step()
     if not _is_alone():
@@ -137,7 +139,7 @@ def _serve_stage(stage: Served, listener: socket.socket, tell: int, root: str, p
     _Children(stage, listener).serve()
 
 
-def _do_at_low_priority(steps: Iterator[Callable[[], object]], listener: socket.socket) -> None:
+def do_at_low_priority(steps: Iterator[Callable[[], object]], listener: socket.socket) -> None:
     """Does one step after another, until all are done or somebody waits at the listener.
 
     In a thread, since a process cannot take its priority back.
@@ -181,6 +183,7 @@ def steps_to_load(path: Path, root: Path) -> Iterator[Callable[[], object]]:
     step by step."""
     for node in first_imports(path):
         yield partial(exec, compile(ast.Module([node], type_ignores=[]), str(path), "exec"), {})
+    yield partial(import_module, "psutil")  # for what measures and limits each stage
     yield partial(loaded_code, (root,))
     yield installed_packages
 

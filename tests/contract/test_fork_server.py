@@ -5,8 +5,13 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
+import threading
+import time
+from functools import partial
+from itertools import chain, repeat
 from pathlib import Path
 
 import pytest
@@ -14,7 +19,7 @@ from toy_runs import REPOSITORY, limn, limn_process, make_subject, wait_for
 
 from shared.contract import fork_client
 from shared.contract.confine import trust
-from shared.contract.fork_server import Served, first_imports
+from shared.contract.fork_server import Served, do_at_low_priority, first_imports
 
 STAGE = '''
 """A stage that tells of its process, and does what the environment says."""
@@ -239,6 +244,21 @@ def test_only_imports_that_every_run_makes_are_made_ahead(tmp_path):
                     'def other():\n    import d\n'
                     'def run(job):\n    """Does."""\n    import e\n    from f.g import h\n\n    job()\n    import i\n')
     assert [ast.unparse(node) for node in first_imports(path)] == ["import a", "import e", "from f.g import h"]
+
+
+def test_what_is_not_loaded_yet_when_a_job_waits_is_loaded_at_full_priority(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with socket.socket(socket.AF_UNIX) as listener, socket.socket(socket.AF_UNIX) as client:
+        listener.bind("stage")
+        listener.listen()
+        priorities = []
+        first = [lambda: priorities.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id())),
+                 lambda: client.connect("stage")]
+        do_at_low_priority(chain(first, repeat(partial(time.sleep, 0.001))), listener)  # it comes back
+        assert priorities[0] > os.getpriority(os.PRIO_PROCESS, 0)
+        steps = iter(first)
+        do_at_low_priority(steps, listener)
+        assert list(steps) == first and len(priorities) == 1  # a job waits already
 
 
 def test_a_served_stage_reads_its_own_text():
