@@ -21,7 +21,7 @@ from shared.appearance.texture import (
     robust_weight,
     weigh_lights,
 )
-from shared.compute.read_ahead import read_ahead
+from shared.compute.read_ahead import work_ahead
 from shared.compute.run_context import SILENT, RunContext
 from shared.compute.threads import share_out
 from shared.imaging.frame_index import spread_frames
@@ -117,7 +117,7 @@ class TexturePass:
     def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> Evidence:
         parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]
         borders = [BorderSums(len(self.surface), self.viewer.error_mm) for _ in self.systematic]
-        ahead = read_ahead(map(self.view, self.progress(frames, label)))
+        ahead = work_ahead(self.view, self.progress(frames, label))
         for f, view in zip(frames, ahead, strict=True):
             part, border = parts[self.views.light_index[f]], borders[self.views.light_index[f]]
             self._share_out(view, lambda lit, part=part, border=border: self._add(material, part, border, lit))
@@ -188,15 +188,14 @@ class TexturePass:
         precision = np.minimum(information, NEIGHBOUR_STEP**-2)
         total = np.maximum(precision.sum(1, keepdims=True), 1e-12)
         share = precision / total
-        tint_precision = precision * (1.0 - share)
-        brightness, tint = [], []
+        known = np.concatenate([total, precision * (1.0 - share)], axis=1)
+        means = []
         for albedo in rough:
             relative = np.log(np.maximum(albedo, 1e-3)) - typical
             level = (share * relative).sum(1, keepdims=True)
-            brightness.append(self.surface.to_vertices(level, total)[0])
-            tint.append(self.surface.to_vertices(relative - level, tint_precision)[0])
-        tint_field = self._field(np.stack(tint, axis=-1), tint_precision, fields)
-        return typical[:, None] + self._field(np.stack(brightness, axis=-1), total, fields) + tint_field
+            means.append(self.surface.to_vertices(np.concatenate([level, relative - level], axis=1), known)[0])
+        field = self._field(np.stack(means, axis=-1), known, fields)
+        return typical[:, None] + field[:, :1] + field[:, 1:]
 
     def _field(self, means: np.ndarray, precision: np.ndarray, fields: SmoothFields) -> np.ndarray:
         """Vertex values [V, C, K], means of texels of some precision [T, C] -> the smooth fields [V, C, K] through
@@ -210,7 +209,7 @@ class TexturePass:
         """Root mean square residual of each candidate on the held-out frames (linear, censored, weighted)."""
         sums = np.zeros(1 + len(candidates))
         frames = self.progress(np.nonzero(~self.views.fitted)[0], "texture, held-out frames")
-        for view in read_ahead(map(self.view, frames)):
+        for view in work_ahead(self.view, frames):
             sums += sum(self._share_out(view, lambda lit: _squared_errors(candidates, lit)))
         return [float(value) for value in np.sqrt(sums[1:] / max(3.0 * sums[0], 1e-9))]
 

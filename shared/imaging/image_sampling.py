@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import scipy.sparse as sparse
 
+from shared.compute.compiled import compiled
 from shared.geometry.mesh import Mesh, face_normals, half_edges, vertex_normals
 from shared.geometry.raycast import RAY_START_MM, RayScene
-from shared.geometry.transforms import project
 from shared.imaging.color import CLIPPED_CODE, CRUSHED_CODE
 
 MINIMUM_VIEW_COSINE, MAXIMUM_LEAST_COSINE = 0.2, 0.5
@@ -121,22 +121,21 @@ class SurfaceViewer:
 
     def view(self, camera_from_head: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]) -> View:
         """All vertices, or those that it is limited to, in one camera. size: (width, height) of the picture, pixels."""
-        vertices, normals = self._vertices, self._normals
-        pixels, depth = project(vertices, camera_from_head, intrinsics)
-        centre = -camera_from_head[:3, 3] @ camera_from_head[:3, :3]
-        towards = centre - vertices
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        cosine = (towards * normals).sum(1)
+        vertices, normals, count = self._vertices, self._normals, len(self._vertices)
+        turn, shift = camera_from_head[:3, :3].astype(np.float64), camera_from_head[:3, 3].astype(np.float64)
+        pixels, towards = np.empty((count, 2)), np.empty((count, 3))
+        depth, cosine, seen = np.empty(count), np.empty(count), np.empty(count, bool)
+        within = np.array([*size, self.least_cosine], np.float64)
+        lens = np.asarray(intrinsics, np.float64)
+        _look(vertices, normals, turn, shift, -shift @ turn, lens, within, pixels, depth, towards, cosine, seen)
         camera = camera_from_head.tobytes(), intrinsics.tobytes(), tuple(size)
         if camera not in self._shown:
-            within = ((pixels > 1.0) & (pixels < np.array(size) - 1.0)).all(1) & (depth > 0)
-            seen = within & (cosine > self.least_cosine)
             index = np.nonzero(seen)[0]
             origins = vertices[index] + RAY_START_MM * normals[index]
-            covered = np.zeros(len(vertices), bool)
+            covered = np.zeros(count, bool)
             covered[index[self.scene.occluded(origins, towards[index])]] = True
             self._shown[camera] = np.packbits(seen & ~self.grown(covered))
-        shown = np.unpackbits(self._shown[camera], count=len(vertices)).astype(bool)
+        shown = np.unpackbits(self._shown[camera], count=count).astype(bool)
         weight = np.where(shown, cosine**2, 0.0)
         return View(pixels, depth, cosine, towards, weight.astype(np.float32))
 
@@ -146,6 +145,25 @@ class SurfaceViewer:
         for _ in range(self.rings):
             grown = np.minimum(grown + self._adjacency @ grown, 1.0)
         return grown > 0
+
+
+@compiled
+def _look(vertices, normals, turn, shift, centre, lens, within, pixels, depth, towards, cosine, seen):
+    """What View says of the vertices [V, 3], and which face the camera within its picture; within: width, height and
+    least cosine."""
+    width, height, least = within
+    for v in range(len(vertices)):
+        x, y, z = vertices[v]
+        across = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z + shift[0]
+        down = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z + shift[1]
+        away = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z + shift[2]
+        px, py = across / away * lens[0, 0] + lens[0, 2], down / away * lens[1, 1] + lens[1, 2]
+        tx, ty, tz = centre[0] - x, centre[1] - y, centre[2] - z
+        nearness = 1.0 / np.sqrt(tx * tx + ty * ty + tz * tz)
+        towards[v, 0], towards[v, 1], towards[v, 2] = tx * nearness, ty * nearness, tz * nearness
+        facing = towards[v, 0] * normals[v, 0] + towards[v, 1] * normals[v, 1] + towards[v, 2] * normals[v, 2]
+        pixels[v, 0], pixels[v, 1], depth[v], cosine[v] = px, py, away, facing
+        seen[v] = (1.0 < px < width - 1.0) and (1.0 < py < height - 1.0) and away > 0.0 and facing > least
 
 
 def prepare_picture(codes: np.ndarray, linear: np.ndarray, mask: np.ndarray) -> Picture:

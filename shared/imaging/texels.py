@@ -17,6 +17,8 @@ from shared.geometry.mesh import Mesh, rasterize_uv, vertex_adjacency
 from shared.imaging.image_sampling import Picture, View, sample_colours, sample_inside, sample_saturation, texel_size
 
 _BLOCK = 1 << 16
+_ACCURACY = 1e-6
+"""Of smooth fields, relative: what maps in half precision show is a thousandth."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,8 @@ class TexelSurface:
     ) -> FrameView:
         """What one frame shows; a face counts as seen when all its corners are. values [V, C]: to interpolate at the
         samples."""
-        seen_face = (view.weight > 0)[self.mesh.faces].all(1)
+        seen_face = np.empty(len(self.mesh.faces), bool)
+        _faces_seen(self.mesh.faces, view.weight, seen_face)
         # Depth times pixel is linear on the surface; the pixel itself is not.
         depth = view.depth[:, None]
         columns = [view.pixels * depth, depth, view.weight[:, None]] + ([] if values is None else [values])
@@ -152,13 +155,13 @@ class SmoothFields:
         """Most likely vertex values [V, C, ...], given values [V, C, ...] of some precision [V, C]; mean [C]."""
         if self._factors is None:
             typical = np.exp(np.log(precision + self._least).mean(1)) - self._least
-            self._factors = factorised(self._prior + sparse.diags(typical))
+            self._factors = factorised((self._prior + sparse.diags(typical)).astype(np.float32))
         factors, count = self._factors, len(values)
 
         def solved(c: int) -> np.ndarray:
             known = precision[:, c]
             right = (values[:, c].reshape(count, -1).T * known + mean[c] * self._least).T
-            return solved_by_factors_of_another(self._prior + sparse.diags(known), right, factors)
+            return solved_by_factors_of_another(self._prior + sparse.diags(known), right, factors, _ACCURACY)
 
         channels = share_out(values.shape[1], solved)
         return np.stack([channel.reshape(values[:, 0].shape) for channel in channels], axis=1)
@@ -171,6 +174,12 @@ def _interpolate(corners, weights, rows, table, found):
         u, v, w = weights[rows[i]]
         for k in range(table.shape[1]):
             found[i, k] = u * table[a, k] + v * table[b, k] + w * table[c, k]
+
+
+@compiled
+def _faces_seen(faces, weight, seen):
+    for f in range(len(faces)):
+        seen[f] = weight[faces[f, 0]] > 0 and weight[faces[f, 1]] > 0 and weight[faces[f, 2]] > 0
 
 
 @compiled

@@ -13,7 +13,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from shared.compute.threads import thread_count
+from shared.compute.compiled import compiled
+from shared.compute.threads import share_out, thread_count
 from shared.geometry.mesh import tangent_frames
 from shared.rendering.transfer import Points, Transfer, position_and_normal
 
@@ -22,7 +23,7 @@ SHADOW_MM = 4.0
 along which visibility is known are two millimetres for each 16 that the shadow falls."""
 
 _PLACES = 6
-_POINTS_PER_BLOCK, _LIGHTS_AT_ONCE = 8192, 48
+_POINTS_PER_BLOCK, _LIGHTS_AT_ONCE = 4096, 48
 
 
 def irradiance_vectors(transfer: Transfer, light: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -31,9 +32,12 @@ def irradiance_vectors(transfer: Transfer, light: np.ndarray, directions: np.nda
     moments = (light[:, None] * directions[..., None] * (4.0 / len(directions))).astype(np.float32)
     moments = moments.reshape(len(light), -1)
     vectors = np.empty((len(transfer.direct), moments.shape[1]), np.float32)
-    for start in range(0, len(vectors), _POINTS_PER_BLOCK):
-        rows = slice(start, start + _POINTS_PER_BLOCK)
+
+    def sum_up(block: int) -> None:
+        rows = slice(block * _POINTS_PER_BLOCK, (block + 1) * _POINTS_PER_BLOCK)
         np.matmul(transfer.visibility(rows).astype(np.float32), moments, out=vectors[rows])
+
+    share_out(-(-len(vectors) // _POINTS_PER_BLOCK), sum_up)
     return vectors.reshape(len(vectors), 3, -1)
 
 
@@ -71,7 +75,24 @@ def shadow_uncertainty(
     for start in range(0, light.shape[1], _LIGHTS_AT_ONCE):
         lights = slice(start, start + _LIGHTS_AT_ONCE)
         vectors = irradiance_vectors(transfer, light[:, lights], directions)
-        own = np.einsum("pxn,px->pn", vectors, normals)
-        for beside in near.T:
-            squared[:, lights] += np.square(np.einsum("pxn,px->pn", vectors[beside], normals) - own)
+
+        def compare(block: int, vectors=vectors, lights=lights) -> None:
+            rows = slice(block * _POINTS_PER_BLOCK, (block + 1) * _POINTS_PER_BLOCK)
+            _compare_beside(vectors, normals[rows], near[rows], rows.start, squared[rows, lights])
+
+        share_out(-(-len(squared) // _POINTS_PER_BLOCK), compare)
     return np.sqrt(squared / near.shape[1])
+
+
+@compiled
+def _compare_beside(vectors, normals, near, first, squared):
+    """Adds to squared [p, N], of the points from `first` on, the squares of n . (W beside - W) over near [p, K]."""
+    for p in range(len(near)):
+        x, y, z = normals[p]
+        for k in range(near.shape[1]):
+            there = near[p, k]
+            for n in range(squared.shape[1]):
+                change = (x * (vectors[there, 0, n] - vectors[first + p, 0, n])
+                          + y * (vectors[there, 1, n] - vectors[first + p, 1, n])
+                          + z * (vectors[there, 2, n] - vectors[first + p, 2, n]))
+                squared[p, n] += change * change

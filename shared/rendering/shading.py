@@ -14,6 +14,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from threading import Lock
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -33,7 +34,7 @@ KEY_STEP = 0.05
 DEEP = 0.9
 """Cosine-weighted share of the hemisphere that the head itself covers, from which on a point counts as in a cavity."""
 
-_POINTS_PER_BLOCK = 512
+_POINTS_PER_BLOCK, _POINTS_PER_PRODUCT = 512, 2048
 
 LARGEST_SHARE = 0.95
 """Of the light that arrives, what a surface can send on: were it all of it, bounces would not end."""
@@ -125,12 +126,24 @@ class VertexShading:
 
     def _receive(self) -> None:
         shape = (len(self.points), *self.light_along.shape[1:])
-        direct = irradiance(self.transfer, self.light_along.reshape(len(self.directions), -1))
-        total = direct if self._node_light is None else direct + bounced_irradiance(self.transfer, self._node_light)
-        self._irradiance = total.reshape(shape).astype(np.float16)
-        self._bounced = (total - direct).reshape(shape).astype(np.float16)
+        lights = self.light_along.reshape(len(self.directions), -1)
+        # A frame's values lie side by side, since frames are asked for one by one.
+        self._irradiance, self._bounced = np.zeros((2, shape[1], shape[0], 3), np.float16).transpose(0, 2, 1, 3)
+
+        def sum_up(block: int) -> None:
+            rows = slice(block * _POINTS_PER_PRODUCT, (block + 1) * _POINTS_PER_PRODUCT)
+            part = self.transfer.take(rows)
+            total = irradiance(part, lights).reshape(-1, *shape[1:])
+            if self._node_light is not None:
+                bounced = bounced_irradiance(part, self._node_light).reshape(total.shape)
+                self._bounced[rows] = bounced
+                total += bounced
+            self._irradiance[rows] = total
+
+        share_out(-(-shape[0] // _POINTS_PER_PRODUCT), sum_up)
         self._key_reflection: dict[int, np.ndarray] = {}
         self._key_uncertainty: np.ndarray | None = None
+        self._once = Lock()  # several threads ask for frames; what they share is made by the first
 
     def _sent_by_nodes(self) -> np.ndarray:
         """[K, F * 3]: the nodes' radiosity over pi, with all diffuse bounces."""
@@ -165,10 +178,11 @@ class VertexShading:
 
     def shadow_uncertainty(self, frame: int) -> np.ndarray:
         """[V, 3] float32: standard deviation of E, given how far off the borders of shadows may be."""
-        if self._key_uncertainty is None:
-            light = self.light_along[:, self._keys].reshape(len(self.directions), -1)
-            uncertainty = shadow_uncertainty(self.points, self.transfer, light, self.directions, SHADOW_MM)
-            self._key_uncertainty = uncertainty.reshape(len(self.points), len(self._keys), 3).astype(np.float16)
+        with self._once:
+            if self._key_uncertainty is None:
+                light = self.light_along[:, self._keys].reshape(len(self.directions), -1)
+                uncertainty = shadow_uncertainty(self.points, self.transfer, light, self.directions, SHADOW_MM)
+                self._key_uncertainty = uncertainty.reshape(len(self.points), len(self._keys), 3).astype(np.float16)
         return self._between_keys(frame, lambda key: self._key_uncertainty[:, np.searchsorted(self._keys, key)])
 
     def _between_keys(self, frame: int, at_key: Callable[[int], np.ndarray]) -> np.ndarray:
@@ -201,20 +215,24 @@ class VertexShading:
 
     def _at_key(self, frame: int) -> np.ndarray:
         """S of the shaded vertices in one frame [P, 3], half floats; made once."""
-        if frame not in self._key_reflection:
-            towards, blocked = self.towards_camera(frame), self.blocked_light(frame)
-            facing = np.nonzero((towards * self.points.normals).sum(1) > -0.1)[0]
-            value = np.zeros((len(self.points), 3), np.float16)
-            light = np.ascontiguousarray(self.light_along[:, frame])
+        with self._once:
+            if frame not in self._key_reflection:
+                self._key_reflection[frame] = self._reflection_of_points(frame)
+            return self._key_reflection[frame]
 
-            def reflect(k: int) -> None:
-                rows = facing[k * _POINTS_PER_BLOCK : (k + 1) * _POINTS_PER_BLOCK]
-                roughness = self.roughness_of(rows)
-                value[rows] = specular_reflection(self.table.take(rows), towards[rows], roughness, light, blocked[rows])
+    def _reflection_of_points(self, frame: int) -> np.ndarray:
+        towards, blocked = self.towards_camera(frame), self.blocked_light(frame)
+        facing = np.nonzero((towards * self.points.normals).sum(1) > -0.1)[0]
+        value = np.zeros((len(self.points), 3), np.float16)
+        light = np.ascontiguousarray(self.light_along[:, frame])
 
-            share_out(-(-len(facing) // _POINTS_PER_BLOCK), reflect)
-            self._key_reflection[frame] = value
-        return self._key_reflection[frame]
+        def reflect(k: int) -> None:
+            rows = facing[k * _POINTS_PER_BLOCK : (k + 1) * _POINTS_PER_BLOCK]
+            roughness = self.roughness_of(rows)
+            value[rows] = specular_reflection(self.table.take(rows), towards[rows], roughness, light, blocked[rows])
+
+        share_out(-(-len(facing) // _POINTS_PER_BLOCK), reflect)
+        return value
 
 
 def _stand_ins(vertices: np.ndarray, index: np.ndarray, blocked: np.ndarray, deep: float) -> np.ndarray:
