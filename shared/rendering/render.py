@@ -7,6 +7,7 @@ the picture can be compared with a camera's.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,13 +44,33 @@ def render_frame(
     size: (width, height); samples: rays per pixel along each axis. frame: the shading's frame. Radiance is the mean
     over the rays that hit the head, so that partly covered pixels are not darkened.
     """
+    (radiance,), coverage = render_lights(
+        viewer, shading, maps, [frame], camera_from_head, intrinsics, size, samples=samples
+    )
+    return radiance, coverage
+
+
+def render_lights(
+    viewer: SurfaceViewer,
+    shading: VertexShading,
+    maps: SurfaceMaps,
+    frames: Sequence[int],
+    camera_from_head: np.ndarray,
+    intrinsics: np.ndarray,
+    size: tuple[int, int],
+    samples: int = 2,
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """As render_frame of several of the shading's frames in which the camera stands alike and the light may not: a
+    ray is traced once for all of them. -> radiance [H, W, 3] of each, and their coverage [H, W]."""
     width, height = size
-    mesh = viewer.mesh
-    shade = np.concatenate([shading.irradiance(frame), shading.reflection(frame)], axis=1)
-    shade, uvs = np.ascontiguousarray(shade, np.float32), mesh.uvs.astype(np.float32)
+    mesh, uvs = viewer.mesh, viewer.mesh.uvs.astype(np.float32)
+    shades = [
+        np.concatenate([shading.irradiance(frame), shading.reflection(frame)], axis=1, dtype=np.float32)
+        for frame in frames
+    ]
     albedo = np.ascontiguousarray(maps.albedo, np.float32)
     intensity = np.ascontiguousarray(maps.specular_intensity, np.float32)
-    radiance, hits = np.zeros((height * width, 3), np.float32), np.zeros(height * width, np.float32)
+    radiance, hits = np.zeros((len(shades), height * width, 3), np.float32), np.zeros(height * width, np.float32)
 
     def render(band: int) -> None:
         first = band * _ROWS_PER_BAND
@@ -60,25 +81,24 @@ def render_frame(
             for column in range(samples):
                 offsets = (column + 0.5) / samples, (row + 0.5) / samples
                 face, bary, _ = camera_hits(viewer.scene, camera_from_head, lens, width, rows, offsets)
-                _add_radiance(
-                    face.ravel(), bary.reshape(-1, 3), mesh.faces, mesh.face_uvs, uvs, albedo, intensity, shade,
-                    radiance[pixels], hits[pixels]
-                )
+                face, bary = face.ravel(), bary.reshape(-1, 3)
+                hits[pixels] += face >= 0
+                for shade, sent in zip(shades, radiance[:, pixels], strict=True):
+                    _add_radiance(face, bary, mesh.faces, mesh.face_uvs, uvs, albedo, intensity, shade, sent)
 
     share_out(-(-height // _ROWS_PER_BAND), render)
     radiance /= np.maximum(hits, 1.0)[:, None]
-    return radiance.reshape(height, width, 3), (hits / samples**2).reshape(height, width)
+    return list(radiance.reshape(-1, height, width, 3)), (hits / samples**2).reshape(height, width)
 
 
 @compiled
-def _add_radiance(face, bary, faces, face_uvs, uvs, albedo, specular_intensity, shade, radiance, hits):
-    """Adds to radiance [N, 3] and hits [N] what rays see: face [N] (-1: nothing), bary [N, 3]; shade [V, 6]: E and S;
+def _add_radiance(face, bary, faces, face_uvs, uvs, albedo, specular_intensity, shade, radiance):
+    """Adds to radiance [N, 3] what rays see: face [N] (-1: nothing), bary [N, 3]; shade [V, 6]: E and S;
     maps as by texture.sample_bilinear."""
     one, half, size = np.float32(1.0), np.float32(0.5), len(albedo)
     for n in range(len(face)):
         if face[n] < 0:
             continue
-        hits[n] += one
         u, v = np.float32(0.0), np.float32(0.0)
         for k in range(3):
             u += bary[n, k] * uvs[face_uvs[face[n], k], 0]

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from shared.compute.threads import share_out
 from shared.geometry.mesh import Mesh, interpolate, normalised
 from shared.geometry.raycast import RAY_START_MM, camera_hits
 from shared.geometry.transforms import camera_centres, rigid, world_from_head
@@ -20,7 +21,7 @@ from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texture import sample_bilinear
 from shared.rendering.envmap import cube_from_latlong, latlong_directions, latlong_lookup
 from shared.rendering.precomputed_transfer import Sizes, precompute_transfer
-from shared.rendering.render import SurfaceMaps, render_frame
+from shared.rendering.render import SurfaceMaps, render_frame, render_lights
 from shared.rendering.shading import DEEP, Material, VertexShading
 from shared.rendering.split_sum import SplitSum
 from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
@@ -66,10 +67,11 @@ def make_views(
     views = HeadViews(mesh, maps, VIEW_SIZES, [*around, camera, front, *held_out.values()], progress)
     novel = views.render(clip_light(envmap, camera_from_head, moves), around)
     again = views.render(envmap, list(held_out.values()), moves, fade=False) if held_out else []
+    covered = share_out(len(ROUGHNESSES), lambda k: views.visibility(front, ROUGHNESSES[k]))
     return ViewSet(
         dict(zip(NOVEL_VIEWS, novel, strict=True)),
         dict(zip(STUDIO_LIGHTS, views.relit([studio_light(name) for name in STUDIO_LIGHTS], camera), strict=True)),
-        {roughness: views.visibility(front, roughness) for roughness in ROUGHNESSES},
+        dict(zip(ROUGHNESSES, covered, strict=True)),
         dict(zip(held_out, again, strict=True)),
     )
 
@@ -188,8 +190,11 @@ class HeadViews:
 
     def relit(self, lights: Sequence[np.ndarray], camera: ViewCamera) -> list[np.ndarray]:
         """A picture, as of render, for each of several lights, given in head space."""
-        cameras = [camera] * len(lights)
-        return self._pictures(self._shading(lights, cameras, "camera"), cameras, fade=True)
+        shading = self._shading(lights, [camera] * len(lights), "camera")
+        pictures, covered = render_lights(
+            self.viewer, shading, self.maps, range(len(lights)), camera.camera_from_head, camera.intrinsics, camera.size
+        )
+        return [picture * covered[..., None] for picture in pictures]
 
     def _pictures(self, shading: VertexShading, cameras: Sequence[ViewCamera], fade: bool) -> list[np.ndarray]:
         """A camera's picture in each of the shading's frames."""
