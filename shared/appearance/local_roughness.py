@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from shared.appearance.problem import AppearanceProblem, AppearanceState
 from shared.appearance.projection import ROUGHNESS_RANGE, best_albedo, project_off_albedo
 from shared.appearance.sample_errors import SampleErrors
-from shared.appearance.transport import Transport
+from shared.appearance.transport import Lobes, Transport
 
 FACTOR, STEPS = 1.18, 2
 """Ratio of neighbouring roughnesses that are tried, and how many to each side."""
@@ -95,14 +95,13 @@ def local_roughness(
     model = state.radiance(irradiance, reflection)
     weight = problem.errors.weights(model)
     errors = problem.errors.with_reduced_chi_square(model, weight)
-    transport = replace(transport, lobes=None)  # a table of lobes is the greatest thing in memory
+    transport = replace(transport, lobes=None)
     equations = specular_equations_of(problem, state, transport, errors, irradiance, weight * errors.fitted)
     specular = torch.from_numpy(equations.specular_at(equations.positions).astype(np.float32))[None, :, None]
     local = np.maximum(equations.roughness(equations.positions), problem.table.narrowest)
     residuals = {}
     for name, tried in (("one", state.roughness), ("local", local)):
-        transport = replace(transport, lobes=problem.lobes_of_each(tried))
-        shown = transport.forward(state.light)[1] * specular
+        shown = reflection_by(transport, problem.lobes_of_each(tried), state.light) * specular
         albedo = best_albedo(errors, irradiance, shown, weight, problem.typical_albedo(state))
         held_out = weight * (1.0 - errors.fitted)
         squared = held_out * (albedo * irradiance + shown - errors.colours).square()
@@ -115,6 +114,12 @@ def local_roughness(
         "found_range": [round(float(low), 4), round(float(high), 4)],
     }
     return (equations if kept else None), record
+
+
+def reflection_by(transport: Transport, lobes: Lobes, light: np.ndarray) -> torch.Tensor:
+    """[3, P, F] by these lobes. A table of them is the greatest thing in memory: here one is gone before the next is
+    made."""
+    return replace(transport, lobes=lobes).forward(light)[1]
 
 
 def specular_equations_of(
@@ -131,8 +136,7 @@ def specular_equations_of(
     logs = np.log(state.roughness) + np.log(FACTOR) * np.arange(-STEPS, STEPS + 1)
     evidence, sums = errors.evidence(weight), []
     for log in logs:
-        transport = replace(transport, lobes=problem.lobes_at(float(np.exp(log))))
-        reflection = transport.forward(state.light)[1]
+        reflection = reflection_by(transport, problem.lobes_at(float(np.exp(log))), state.light)
         pure = project_off_albedo(reflection, irradiance, weight)
         sums.append([(weight * pure * seen).sum((0, 2)).double().numpy() for seen in (reflection, errors.colours)])
     curvature, moment = evidence * np.moveaxis(np.array(sums), 1, 0)

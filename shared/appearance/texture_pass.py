@@ -108,6 +108,7 @@ class TexturePass:
             for width in widths
         ]
         candidates = self._close(evidence, pooled, fields)
+        del evidence, fields  # a hundred bytes per texel that the frames to come need
         errors = self.held_out_errors(candidates)
         best = int(np.argmin(errors))
         names = ["one value" if not np.isfinite(width) else f"{width:g} texels" for width in widths]

@@ -104,13 +104,15 @@ def solve_clip(
     diagnostics, solution = examine(lit, settings.appearance, solution)
 
     # Under that light, of that shape: every texel's material, and relief finer than the mesh.
-    viewer = lit.viewer.within_rim(surface_error(lit.surface.tracks))
-    shading = shade_vertices(views, viewer, lit.precomputed, settings.appearance, solution, context)
-    texels = TexelSurface(lit.surface.mesh, settings.map_size)
+    surface, precomputed = lit.surface, lit.precomputed
+    viewer = lit.viewer.within_rim(surface_error(surface.tracks))
+    lit = lit_then = None  # texels need the memory that the points' samples and transfer take
+    shading = shade_vertices(views, viewer, precomputed, settings.appearance, solution, context)
+    texels = TexelSurface(surface.mesh, settings.map_size)
     typical = np.median(solution.state.albedo, axis=0)
     texture = TexturePass(
         texels, viewer, shading, views, specular=specular_at(texels, solution), typical_albedo=typical,
-        light_weights=solution.light_weights, region=scalp_of(lit.surface), context=context,
+        light_weights=solution.light_weights, region=scalp_of(surface), context=context,
     )
     widths = settings.map_size * np.array(settings.specular_widths if settings.appearance.specular else (np.inf,))
     material, texture_record = texture.run(widths)
@@ -120,7 +122,7 @@ def solve_clip(
         turn, relief = fine.run(resolved_texels(texels, views))
         context.note(f"fine normals: {relief}")
     roughness, local = solution.state.roughness, solution.local_roughness_fit
-    roughness = roughness if local is None else local.roughness(lit.surface.mesh.vertices)
+    roughness = roughness if local is None else local.roughness(surface.mesh.vertices)
     record = {
         "texture": texture_record,
         "shape": {**shape_record, "outline": outline},
