@@ -40,7 +40,7 @@ def average_frames(job: Job, views, texels, viewer) -> tuple:
     """Weighted mean radiance [T, 3] and total weight [T] of the texels over the chosen views."""
     import numpy as np
 
-    from shared.compute.read_ahead import read_ahead
+    from shared.compute.read_ahead import work_ahead
     from shared.compute.threads import share_out
     from shared.imaging.frame_index import spread_frames
 
@@ -56,7 +56,7 @@ def average_frames(job: Job, views, texels, viewer) -> tuple:
         total[rows] += samples.weight[:, None] * samples.colours
         weight[rows] += samples.weight
 
-    for view in read_ahead(map(look, job.progress(chosen, "projecting frames", total=len(chosen)))):
+    for view in work_ahead(look, job.progress(chosen, "projecting frames", total=len(chosen))):
         blocks = view.blocks()
         share_out(len(blocks), lambda k, view=view, blocks=blocks: add(view, blocks[k]))
     return total / np.maximum(weight, 1e-6)[:, None], weight

@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter
 
 from shared.appearance.texture import CORRELATED_FRAMES, Noise, TexelMaterial, robust_weight
 from shared.compute.compiled import compiled
-from shared.compute.read_ahead import read_ahead
+from shared.compute.read_ahead import work_ahead
 from shared.compute.run_context import SILENT, RunContext
 from shared.compute.threads import share_out
 from shared.geometry.mesh import Mesh, normalised, vertex_adjacency
@@ -162,20 +162,21 @@ class NormalPass:
     def accumulate(self, frames: np.ndarray) -> ReliefEquations:
         """The equations of some frames [n] int, numbers of views."""
         sums = ReliefSums(len(self.surface))
-        for view in read_ahead(self.frame_views(self.progress(frames, "fine normals"), frames)):
+        slopes = self.slopes(self.progress(frames, "fine normals"), frames)
+        for view in work_ahead(lambda shown: self.view(shown[0], slope=shown[1]), slopes):
             self._add(view, sums)
         return sums.equations()
 
-    def frame_views(self, shown: Iterable[int], frames: np.ndarray) -> Iterator[FrameView]:
-        """view(f) of the frames [n], which shown gives one by one. The derivative of E is W, see irradiance_vectors;
-        that of some frames is one product."""
+    def slopes(self, shown: Iterable[int], frames: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+        """Each of the frames [n], which shown gives one by one, with what view takes. The derivative of E is W, see
+        irradiance_vectors; that of some frames is one product."""
         shading = self.shading
         for k, f in enumerate(shown):
             if k % _TOGETHER == 0:
                 light = shading.light_along[:, frames[k : k + _TOGETHER]].reshape(len(shading.directions), -1)
                 vectors = irradiance_vectors(shading.transfer, light, shading.directions)
             first = 3 * (k % _TOGETHER)
-            yield self.view(f, vectors[..., first : first + 3].transpose(0, 2, 1))
+            yield f, vectors[..., first : first + 3].transpose(0, 2, 1)
 
     def view(self, f: int, slope: np.ndarray) -> FrameView:
         """One frame with E, S [3] and their derivatives by the normal [3, 3] of each vertex, 24 values; slope [P, 3
