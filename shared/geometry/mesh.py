@@ -50,16 +50,37 @@ def tangent_frames(normals: np.ndarray) -> np.ndarray:
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """[V, 3], [F, 3] -> [V, 3] unit normals, faces weighted by their angle at the vertex."""
-    corners = vertices[faces]
-    normals = normalised(face_normals(vertices, faces))
-    total = np.zeros_like(vertices, dtype=np.float64)
-    to_next = [normalised(corners[:, (k + 1) % 3] - corners[:, k]) for k in range(3)]
-    for k in range(3):
-        x, y, z = (to_next[k] * -to_next[k - 1]).T
-        angle = np.arccos(np.clip(x + y + z, -1.0, 1.0))
-        for axis in range(3):
-            total[:, axis] += np.bincount(faces[:, k], normals[:, axis] * angle, len(vertices))
+    total = np.zeros((len(vertices), 3))
+    _add_normals(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64), total)
     return normalised(total)
+
+
+@compiled
+def _add_normals(vertices, faces, total):
+    """Adds to total [V, 3] each face's unit normal times its angle at the corner."""
+    edges = np.empty((3, 3))
+    for f in range(len(faces)):
+        for k in range(3):
+            here, following = faces[f, k], faces[f, (k + 1) % 3]
+            squared = 0.0
+            for axis in range(3):
+                edges[k, axis] = vertices[following, axis] - vertices[here, axis]
+                squared += edges[k, axis] * edges[k, axis]
+            length = max(np.sqrt(squared), 1e-20)
+            for axis in range(3):
+                edges[k, axis] /= length
+        x = edges[0, 1] * edges[1, 2] - edges[0, 2] * edges[1, 1]
+        y = edges[0, 2] * edges[1, 0] - edges[0, 0] * edges[1, 2]
+        z = edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0]
+        length = max(np.sqrt(x * x + y * y + z * z), 1e-20)
+        for k in range(3):
+            cosine = 0.0
+            for axis in range(3):
+                cosine -= edges[k, axis] * edges[k - 1, axis]
+            angle = np.arccos(min(max(cosine, -1.0), 1.0)) / length
+            total[faces[f, k], 0] += x * angle
+            total[faces[f, k], 1] += y * angle
+            total[faces[f, k], 2] += z * angle
 
 
 def shading_normals(mesh: Mesh) -> np.ndarray:
