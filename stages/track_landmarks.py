@@ -235,18 +235,31 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
     write_png(job.out / "residuals.png", residual_map(mesh, track.points_head, residual))
 
 
+def load_solver():
+    """The solver's libraries, which take a second to load, and the head model."""
+    import shared.tracking.track_head  # noqa: F401
+    from shared.tracking.models import load_head_model
+
+    return load_head_model().subdivided()
+
+
 def run(job: Job) -> None:
     """Landmarks, tracks, poses, head."""
+    from concurrent.futures import ThreadPoolExecutor
+
     from shared.compute.processor import use_baseline_opencv
     from shared.errors import InputError
     from shared.io.frames import FrameSet
     from shared.tracking.given_tracking import read_given_poses
-    from shared.tracking.models import load_head_model
-    from shared.tracking.track_head import track_head
 
     use_baseline_opencv()
-    frames, model = FrameSet.open(job.input("sample_frames")), load_head_model().subdivided()
-    landmarks_px, presence, greys = look_at_frames(job, frames)
+    frames = FrameSet.open(job.input("sample_frames"))
+    with ThreadPoolExecutor(1) as beside:
+        loading = beside.submit(load_solver)
+        landmarks_px, presence, greys = look_at_frames(job, frames)
+        model = loading.result()
+    from shared.tracking.track_head import track_head
+
     given_poses = None
     if job.subject.poses is not None:
         given_poses, posed = read_given_poses(job.subject.poses, frames.frame_index)

@@ -17,7 +17,7 @@ from shared.geometry.atlas import sample
 from shared.geometry.mesh import Mesh, normalised, vertex_normals
 from shared.imaging.color import LUMINANCE, encode_srgb
 from shared.imaging.texels import TexelSurface
-from shared.tracking.tracks import local_contrast
+from shared.tracking.tracked_clip import local_contrast
 
 SEEN_WEIGHT = 2.0
 """Frames seen head-on from which on a mean texel shows more skin than noise."""

@@ -1,6 +1,6 @@
 """From frames to poses and a head: dense tracks, bundle adjustment, uncertainty, the head model and its fit.
 
-Read in this order: tracks, tracked_clip, pnp, head_model, models, given_tracking, motion_prior, bundle_loops,
+Read in this order: tracked_clip, tracks, pnp, head_model, models, given_tracking, motion_prior, bundle_loops,
 bundle, depth_noise, fit_head, first_poses, texture_tracks, texture_tracking, focal_search, pose_uncertainty,
 fit_surface, track_head, track_quality.
 May import: errors, contract, compute, geometry, io, capture.

@@ -1,4 +1,7 @@
-"""What tracking looks at."""
+"""What tracking looks at.
+
+Loads nothing but OpenCV and numpy: frames are looked at while the solver's libraries are still being loaded.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,31 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from shared.tracking.tracks import local_contrast, unusable_pixels
-
 DETAIL_SIGMA_PX = 1.2
 """The finest texture moves least with the light: it halves the pose error against a scale four times as wide."""
+
+
+CRUSHED_CODE, CLIPPED_CODE = 8, 250
+"""8-bit code values at and beyond which a pixel says nothing of the skin's texture."""
+
+
+def local_contrast(grey: np.ndarray, sigma_px: float, spread_px: float, floor: float) -> np.ndarray:
+    """Log image minus its local mean over its local spread: [H, W] uint8 -> [H, W] uint8, 128 is the mean.
+
+    sigma_px and spread_px: reach of the mean and of the spread; floor: spread of log radiance below which is noise.
+    """
+    log = np.log(np.arange(256) + 8.0).astype(np.float32)[grey]  # of doubles: single ones differ by the processor
+    detail = log - cv2.GaussianBlur(log, (0, 0), sigma_px)
+    spread = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), spread_px)) + floor
+    return np.clip(np.rint(detail / spread * 45.0 + 128.0), 0, 255).astype(np.uint8)
+
+
+def unusable_pixels(rgb: np.ndarray) -> np.ndarray:
+    """[H, W, 3] uint8 -> [H, W] uint8, 1 where a channel is clipped or all are crushed, grown by two pixels."""
+    red, green, blue = cv2.split(rgb)
+    brightest = cv2.max(cv2.max(red, green), blue)
+    bad = (brightest >= CLIPPED_CODE) | (brightest <= CRUSHED_CODE)
+    return cv2.dilate(bad.astype(np.uint8), np.ones((5, 5), np.uint8))
 
 
 @dataclass(frozen=True)

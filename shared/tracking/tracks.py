@@ -22,29 +22,6 @@ from shared.geometry.mesh import interpolate, normalised
 from shared.geometry.raycast import RayScene, camera_hits
 from shared.geometry.transforms import camera_centres
 
-CRUSHED_CODE, CLIPPED_CODE = 8, 250
-"""8-bit code values at and beyond which a pixel says nothing of the skin's texture."""
-
-
-def local_contrast(grey: np.ndarray, sigma_px: float, spread_px: float, floor: float) -> np.ndarray:
-    """Log image minus its local mean over its local spread: [H, W] uint8 -> [H, W] uint8, 128 is the mean.
-
-    sigma_px and spread_px: reach of the mean and of the spread; floor: spread of log radiance below which is noise.
-    """
-    log = np.log(np.arange(256) + 8.0).astype(np.float32)[grey]  # of doubles: single ones differ by the processor
-    detail = log - cv2.GaussianBlur(log, (0, 0), sigma_px)
-    spread = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), spread_px)) + floor
-    return np.clip(np.rint(detail / spread * 45.0 + 128.0), 0, 255).astype(np.uint8)
-
-
-def unusable_pixels(rgb: np.ndarray) -> np.ndarray:
-    """[H, W, 3] uint8 -> [H, W] uint8, 1 where a channel is clipped or all are crushed, grown by two pixels."""
-    red, green, blue = cv2.split(rgb)
-    brightest = cv2.max(cv2.max(red, green), blue)
-    bad = (brightest >= CLIPPED_CODE) | (brightest <= CRUSHED_CODE)
-    return cv2.dilate(bad.astype(np.uint8), np.ones((5, 5), np.uint8))
-
-
 LEAST_SHOWN = 20
 """A frame that shows fewer of the grid's points is not tracked."""
 

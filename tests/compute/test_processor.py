@@ -10,7 +10,7 @@ from shared.compute.processor import use_baseline_opencv
 from shared.geometry.transforms import rigid, rotation_from_vector
 from shared.rendering.transfer import spread_vertices
 from shared.tracking.first_poses import choose_references
-from shared.tracking.tracks import local_contrast
+from shared.tracking.tracked_clip import local_contrast
 
 
 @pytest.fixture

@@ -7,13 +7,12 @@ from toy_plane import LENS, PLANE, SIZE, plane_texture, see_plane
 from shared.geometry.mesh import vertex_normals
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import project, rigid
+from shared.tracking.tracked_clip import local_contrast, unusable_pixels
 from shared.tracking.tracks import (
     dense_tracks,
     grid_from_landmarks,
     grid_from_mesh,
-    local_contrast,
     points_on_grid,
-    unusable_pixels,
     visible_vertices,
 )
 
