@@ -34,12 +34,15 @@ def load_face_networks() -> FaceNetworks:
 
 
 _of_thread = threading.local()
+_one_at_a_time = threading.Lock()
+"""OpenCV sets up its table of layers when the first network is read: a second thread finds a part of it."""
 
 
 def own_face_networks() -> FaceNetworks:
     """The networks of the calling thread, loaded at its first call: each runs one picture at a time."""
     if not hasattr(_of_thread, "networks"):
-        _of_thread.networks = load_face_networks()
+        with _one_at_a_time:
+            _of_thread.networks = load_face_networks()
     return _of_thread.networks
 
 
