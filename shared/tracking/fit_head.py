@@ -49,6 +49,8 @@ class HeadFit:
 
 
 EFFECTIVE_TRACKS = 100.0
+REACHES_MM, LATER_REACHES_MM = (15.0,) * 4 + (6.0,) * 8, (6.0,) * 4
+"""How far a track point may lie from the surface, step by step: of a first fit, and of one that starts from another."""
 APERTURES = np.array(
     [(160, 144), (159, 145), (158, 153), (387, 373), (386, 374), (385, 380), (82, 87), (13, 14), (312, 317)]
 )
@@ -81,14 +83,22 @@ skin reaches the fit here as tracks."""
 
 
 def fit_codes(
-    model: HeadModel, points: np.ndarray, landmarks: np.ndarray, weights: FitWeights, iterations: int = 12
+    model: HeadModel,
+    points: np.ndarray,
+    landmarks: np.ndarray,
+    weights: FitWeights,
+    before: HeadFit | None = None,
 ) -> HeadFit:
     """Similarity, identity and expression by alternating closest points and one bounded linear solution.
 
-    points [N, 3] and landmarks [468, 3] in track space (NaN rows: unknown).
+    points [N, 3] and landmarks [468, 3] in track space (NaN rows: unknown). before: a fit of the same head, whose codes
+    it starts from; a third of the steps are enough then.
     """
     known = np.isfinite(landmarks[:, 0]) & (model.landmark_weight > 0) & (model.landmark_face >= 0)
-    identity, expression = np.zeros(len(model.identity_basis)), np.zeros(len(model.expression_basis))
+    if before is None:
+        identity, expression = np.zeros(len(model.identity_basis)), np.zeros(len(model.expression_basis))
+    else:
+        identity, expression = before.identity, before.expression
     vertices = model.shape(identity, expression)
     named = model.landmarks(vertices)
     scale, rotation, translation = similarity_from_points(
@@ -96,8 +106,7 @@ def fit_codes(
     )
     fit = HeadFit(scale, rotation, translation, identity, expression, vertices)
     usable = pullable_vertices(model)
-    for step in range(iterations):
-        reach = 15.0 if step < 4 else 6.0
+    for reach in REACHES_MM if before is None else LATER_REACHES_MM:
         fit = _code_step(model, fit, points, landmarks, known, weights, usable, reach)
     return fit
 

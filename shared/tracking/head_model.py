@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+import scipy.sparse as sparse
 
 from shared.geometry.mesh import Mesh, interpolate, loop_subdivision, midpoint_subdivision
 
@@ -24,6 +25,7 @@ class HeadModel:
     expression_names [E]; faces [F, 3]; uvs [T, 2]; face_uvs [F, 3]; face_segment [F] index into
     segment_names; landmark_face [468] (-1: none) and landmark_bary [468, 3]: where each landmark of
     shared.capture.landmarks lies; landmark_weight [468] in [0, 1], 0 where it slides over the skin.
+    from_coarser [V, V0]: the Loop step from the level before, None at level 0.
     """
 
     template: np.ndarray
@@ -38,18 +40,19 @@ class HeadModel:
     landmark_face: np.ndarray
     landmark_bary: np.ndarray
     landmark_weight: np.ndarray
+    from_coarser: sparse.csr_matrix | None = None
 
     @staticmethod
     def from_arrays(arrays: dict[str, np.ndarray]) -> HeadModel:
-        """From the arrays of `to_arrays`. KeyError where one is missing."""
-        values = {field.name: arrays[field.name] for field in fields(HeadModel)}
+        """From the arrays of `to_arrays`, which are of level 0. KeyError where one is missing."""
+        values = {name: arrays[name] for name in _array_names()}
         for name in ("expression_names", "segment_names"):
             values[name] = tuple(str(item) for item in values[name])
         return HeadModel(**values)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays, without pickled objects; the bases as float32 (rounding below 1e-5 mm)."""
-        arrays = {field.name: np.asarray(getattr(self, field.name)) for field in fields(HeadModel)}
+        arrays = {name: np.asarray(getattr(self, name)) for name in _array_names()}
         for name in ("identity_basis", "expression_basis"):
             arrays[name] = arrays[name].astype(np.float32)
         return arrays
@@ -95,7 +98,12 @@ class HeadModel:
             face_segment=np.repeat(self.face_segment, 4),
             landmark_face=landmark_face,
             landmark_bary=landmark_bary,
+            from_coarser=smooth,
         )
+
+
+def _array_names() -> list[str]:
+    return [field.name for field in fields(HeadModel) if field.name != "from_coarser"]
 
 
 def child_location(face: np.ndarray, bary: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

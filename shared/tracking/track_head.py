@@ -29,7 +29,7 @@ from shared.tracking.first_poses import (
     start_from_landmarks,
 )
 from shared.tracking.fit_head import FitWeights, HeadFit, fit_codes, landmarks_on_points
-from shared.tracking.fit_surface import fit_surface
+from shared.tracking.fit_surface import ThinPlate, fit_surface
 from shared.tracking.head_model import HeadModel
 from shared.tracking.pose_uncertainty import estimate_uncertainty, focal_elsewhere
 from shared.tracking.texture_tracking import TrackingPass, coarse_pass, solve_texture, track_texture
@@ -102,12 +102,14 @@ def track_head(
     note(f"landmarks: {posed.sum()} of {len(posed)} frames with a pose, {np.nanmedian(start.error_px):.2f} px")
     found = flow_over_landmarks(few, start, posed, settings.flow, progress)
     note(_summary("flow over landmarks", found))
-    found = flow_over_head(few, model, _fit(few, model, found, settings)[0], found, settings.flow, progress)
+    heads = _HeadFits(model, settings.fit)
+    fit, _ = heads.fit(few, found, rough=True)
+    found = flow_over_head(few, model, fit, found, settings.flow, progress)
     note(_summary("flow over the head", found))
     refuse_still_head(found.solution.camera_from_points[found.reliable])
     with ThreadPoolExecutor(1) as beside:
         searching = beside.submit(focal_elsewhere, few, found)
-        fit, _ = _fit(few, model, found, settings)
+        fit, _ = heads.fit(few, found, rough=True)
         elsewhere = searching.result()
     poses, known = _onto_all(clip, model, chosen, fit, found)
     found = _texture_pass(clip, model, fit, poses, known, coarse_pass(clip.face_width_px), progress)
@@ -117,7 +119,7 @@ def track_head(
         settings.texel_px, True, settings.tracks, Windows(sigma=settings.window_sigma), settings.prior_mm
     )
     for _ in range(settings.fine_passes):
-        fit, _ = _fit(clip, model, found, settings)
+        fit, _ = heads.fit(clip, found, rough=True)
         before = fit.camera_from_head(found.solution.camera_from_points)
         finer, aside = _fine_pass(clip, model, fit, before, found.reliable, fine, progress)
         note(_summary("fine tracks", finer))
@@ -130,7 +132,7 @@ def track_head(
     found = estimated.adjusted
     note(f"noise factor {estimated.noise_factor:.2f}, focal length {estimated.focal_gain:.4f} of the given one")
     lens = zoomed(clip.intrinsics, estimated.focal_gain if estimated.focal_solved else 1.0)
-    fit, noise = _fit(replace(clip, intrinsics=lens), model, found, settings)
+    fit, noise = heads.fit(replace(clip, intrinsics=lens), found, rough=False)
     note(f"depth of a track point: {fit.scale * noise.single:.2f} mm, with what neighbours share "
          f"{fit.scale * np.median(noise.sigma):.2f} mm")
     unit = np.r_[1.0, 1.0, 1.0, np.full(3, fit.scale)]
@@ -237,16 +239,26 @@ def _summary(label: str, found: Adjusted) -> str:
     return f"{label}: {len(found.solution.points)} tracks, {error:.3f} px median, {found.reliable.sum()} frames"
 
 
-def _fit(clip, model, found: Adjusted, settings) -> tuple[HeadFit, DepthNoise]:
-    """Codes, then the free correction, to track points and to the landmarks as they lie among them."""
-    solution, reliable = found.solution, found.reliable
-    poses = solution.camera_from_points[reliable]
-    directions = normalised(camera_centres(poses))
-    central = np.argsort(-(directions @ normalised(directions.mean(0))))[:LANDMARK_FRAMES]
-    landmarks = landmarks_on_points(
-        clip.landmarks_px[reliable][central], poses[central], solution.points, clip.intrinsics
-    )
-    noise = depth_noise(solution, reliable, clip.intrinsics)
-    weights = settings.fit.for_depth_noise(noise)
-    fit = fit_codes(model, solution.points, landmarks, weights)
-    return fit_surface(model, fit, solution.points, noise, weights), noise
+class _HeadFits:
+    """The head fitted again and again as tracks get better. A rough fit starts from the codes of the one before; the
+    last starts from the mean head, so that its shape does not hang on how often the head was fitted."""
+
+    def __init__(self, model: HeadModel, weights: FitWeights) -> None:
+        self._model, self._weights, self._plate = model, weights, ThinPlate(model)
+        self._last: HeadFit | None = None
+
+    def fit(self, clip: TrackedClip, found: Adjusted, rough: bool) -> tuple[HeadFit, DepthNoise]:
+        """Codes, then the free correction, to track points and to the landmarks as they lie among them. rough: see
+        shared.tracking.fit_surface."""
+        solution, reliable = found.solution, found.reliable
+        poses = solution.camera_from_points[reliable]
+        directions = normalised(camera_centres(poses))
+        central = np.argsort(-(directions @ normalised(directions.mean(0))))[:LANDMARK_FRAMES]
+        landmarks = landmarks_on_points(
+            clip.landmarks_px[reliable][central], poses[central], solution.points, clip.intrinsics
+        )
+        noise = depth_noise(solution, reliable, clip.intrinsics)
+        weights = self._weights.for_depth_noise(noise)
+        codes = fit_codes(self._model, solution.points, landmarks, weights, self._last if rough else None)
+        self._last = fit_surface(self._plate, codes, solution.points, noise, weights, rough)
+        return self._last, noise

@@ -10,7 +10,7 @@ from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import project, rigid, rotation_from_vector
 from shared.tracking.depth_noise import DepthNoise
 from shared.tracking.fit_head import FitWeights, fit_codes, landmarks_on_points, triangulate
-from shared.tracking.fit_surface import fit_surface
+from shared.tracking.fit_surface import ThinPlate, fit_surface
 
 MODEL = toy_head()
 ROTATION = rotation_from_vector(np.array([0.1, -0.2, 0.05]))
@@ -49,7 +49,7 @@ def test_free_correction_takes_up_what_the_codes_cannot():
     points, landmarks = observed(truth)
     codes = fit_codes(MODEL, points, landmarks, WEIGHTS)
     noise = DepthNoise(np.full(len(points), 0.05), 0.05)
-    free = fit_surface(MODEL, codes, points, noise, FitWeights())
+    free = fit_surface(ThinPlate(MODEL), codes, points, noise, FitWeights())
     near = np.linalg.norm(truth - [30.0, 20.0, 80.0], axis=1) < 18.0
 
     def distance(vertices):
@@ -64,8 +64,9 @@ def test_free_correction_takes_up_what_the_codes_cannot():
 def test_free_correction_is_stiff_where_depth_is_noise():
     points, landmarks = observed(true_head(), noise_mm=2.0)
     codes = fit_codes(MODEL, points, landmarks, WEIGHTS)
+    plate = ThinPlate(MODEL)
     bent = [
-        np.std(fit_surface(MODEL, codes, points, DepthNoise(np.full(len(points), said), said), FitWeights()).vertices
+        np.std(fit_surface(plate, codes, points, DepthNoise(np.full(len(points), said), said), FitWeights()).vertices
                - codes.vertices)
         for said in (0.05, 2.0)
     ]
