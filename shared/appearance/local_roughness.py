@@ -117,8 +117,8 @@ def local_roughness(
 
 
 def reflection_by(transport: Transport, lobes: Lobes, light: np.ndarray) -> torch.Tensor:
-    """[3, P, F] by these lobes. A table of them is the greatest thing in memory: here one is gone before the next is
-    made."""
+    """Reflection [3, P, F] of a light [K, 3] by these lobes. A table of them is the greatest thing in memory: here one
+    is gone before the next is made."""
     return replace(transport, lobes=lobes).forward(light)[1]
 
 
