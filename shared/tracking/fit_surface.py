@@ -25,7 +25,7 @@ SURFACE_REACH_MM = 8.0
 LEAST_RELIEF_MM = 0.3
 """No head is closer to the model than this."""
 CONTACT_MM, CONTACT_WEIGHT, FACING_COSINE = 2.5, 1.0, -0.5
-STEPS, ROUGH_STEPS = (256.0, 64.0, 16.0, 4.0, 1.0), (64.0, 8.0, 1.0)
+STEPS = (256.0, 64.0, 16.0, 4.0, 1.0)
 """By how much the plate is stiffer than at the end: the first places under the points are far from the last."""
 
 
@@ -52,7 +52,7 @@ def fit_surface(
 
     A stiffer plate, with which it begins, moves as a coarser mesh does: displacements are then those of the level
     before, smoothed, a quarter of the unknowns. They are off by 0.002 mm there, by 0.004 mm at the last stiffness.
-    rough: fewer steps, all of them so; what tracking needs between its passes.
+    rough: all steps so; what tracking needs between its passes.
     """
     model, bending, smooth = plate.model, plate.bending, plate.smooth
     contact = CONTACT_WEIGHT * _contact(model, fit.vertices)
@@ -61,7 +61,7 @@ def fit_surface(
     variance = float(np.median(fit.scale * noise.sigma)) ** 2
     under = _under(plate, vertices, in_head, SURFACE_REACH_MM)
     final = weights.stiffness * variance / _relief(under.offset, fit.scale * noise.single)
-    for step, stiffer in enumerate(ROUGH_STEPS if rough else STEPS):
+    for step, stiffer in enumerate(STEPS):
         under = _under(plate, vertices, in_head, SURFACE_REACH_MM) if step else under
         rows = np.repeat(np.arange(len(under.bary)), 3)
         interpolation = sparse.csr_matrix(
