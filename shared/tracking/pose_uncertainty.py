@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from shared.compute.parallel import shared_out
 from shared.geometry.transforms import nearest_rotation, vector_from_rotation
 from shared.tracking.bundle import BundleSolution, Tracks, adjust, pose_covariance, zoomed
 from shared.tracking.first_poses import LOSS, Adjusted, adjust_clip
@@ -57,33 +58,30 @@ class EstimatedPoses:
     held_off: tuple[float, float] | None = None
 
 
-def noise_factor(
-    tracks: Tracks, solution: BundleSolution, intrinsics: np.ndarray, prior_mm: float
-) -> float:
+def noise_factor(tracks: Tracks, solution: BundleSolution, intrinsics: np.ndarray, prior_mm: float) -> float:
     """By how much the whitening overstates what the tracks know of the poses: at least 1.
 
     Two halves of the face give two whole solutions, points and all. Median over frames of the squared Mahalanobis
     distance between their rotations, over that of unit noise; the largest over several ways to halve. Frames that show
     too little of either half stay aside.
     """
+
+    def half_solved(half: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        shown, chosen = half
+        poses, points = solution.camera_from_points[shown], solution.points[chosen]
+        solved = adjust(tracks.subset(shown, chosen), poses, points, intrinsics, loss_scale=LOSS, prior_mm=prior_mm)
+        return solved.camera_from_points[:, :3, :3]
+
     covariance = pose_covariance(solution, tracks, intrinsics, loss_scale=LOSS).poses[:, :3, :3]
-    ratios = [1.0]
+    halves = []
     for patch_mm in PATCHES_MM:
         odd = np.floor(solution.points / patch_mm).astype(int).sum(1) % 2 == 1
         shown = np.minimum(tracks.seen[:, odd].sum(1), tracks.seen[:, ~odd].sum(1)) >= LEAST_HALF
-        if shown.sum() < 3:
-            continue
-        first, second = [
-            adjust(
-                tracks.subset(shown, half),
-                solution.camera_from_points[shown],
-                solution.points[half],
-                intrinsics,
-                loss_scale=LOSS,
-                prior_mm=prior_mm,
-            ).camera_from_points[:, :3, :3]
-            for half in (odd, ~odd)
-        ]
+        if shown.sum() >= 3:
+            halves += [(shown, odd), (shown, ~odd)]
+    solved = shared_out(half_solved, halves)
+    ratios = [1.0]
+    for (shown, _), first, second in zip(halves[::2], solved[::2], solved[1::2], strict=True):
         apart = rotations_apart(first, second)
         distance = np.einsum("fi,fi->f", apart, np.linalg.solve(4.0 * covariance[shown], apart[..., None])[..., 0])
         ratios.append(float(np.sqrt(np.median(distance) / CHI_SQUARED_MEDIAN_3)))
@@ -137,15 +135,21 @@ def estimate_uncertainty(
     factor = SHARED_ERRORS * noise_factor(tracks, start, clip.intrinsics, prior_mm)
     tracks, loss = tracks.with_noise(factor), LOSS / factor
     motion = motion_prior_of(poses, time_s)
-    solved = adjust_clip(clip, tracks, poses, solution.points, prior_mm, loss, motion=motion)
     lens, points = clip.intrinsics, solution.points
-    free = adjust(
-        tracks, poses, points, lens, loss_scale=loss, prior_mm=prior_mm, motion=motion, refine_focal=True
-    )
-    if elsewhere is not None:
+
+    def held_lens() -> BundleSolution:
+        return adjust_clip(clip, tracks, poses, points, prior_mm, loss, motion=motion)
+
+    def free_lens() -> BundleSolution:
+        if elsewhere is None:
+            return adjust(
+                tracks, poses, points, lens, loss_scale=loss, prior_mm=prior_mm, motion=motion, refine_focal=True
+            )
         gain, away = elsewhere[0], farther(poses, points, elsewhere[0])
         free = adjust(tracks, away, points, zoomed(lens, gain), loss_scale=loss, prior_mm=PRIOR_MM, motion=motion)
-        free = replace(free, focal_gain=gain)
+        return replace(free, focal_gain=gain)
+
+    solved, free = shared_out(lambda solve: solve(), (held_lens, free_lens))
     uncertain = pose_covariance(free, tracks, lens, loss_scale=loss, motion=motion, with_focal=True)
     if elsewhere is not None:
         uncertain = replace(uncertain, log_focal=elsewhere[1])
