@@ -116,6 +116,23 @@ def test_a_damaged_picture_is_said_and_the_page_is_written(result, tmp_path):
     assert "a picture that cannot be read" in overview_page(one, load_pipeline(), tmp_path)
 
 
+def test_pictures_are_read_once_while_the_files_stay_the_same(result, tmp_path, monkeypatch):
+    copy = shutil.copytree(result, tmp_path / "anna")
+    (copy / "work").mkdir(exist_ok=True)
+    one = [Outcome("anna", "in", "done", "export_usd", results=str(copy))]
+    page = overview_page(one, load_pipeline(), tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr("tools.cli.thumbnails.result_pictures", pytest.fail)
+        assert overview_page(one, load_pipeline(), tmp_path) == page and "data:image/jpeg" in page
+    kept = copy / "work" / "thumbnails.json"
+    for damaged in ('{"sources": 1}', "[]", kept.read_text().replace("data:image/jpeg", "data:text/html")):
+        kept.write_text(damaged)
+        assert overview_page(one, load_pipeline(), tmp_path) == page
+    render = copy / "export" / "renders" / f"{RENDERED[1]:04d}.exr"
+    render.write_bytes(render.read_bytes()[:200])
+    assert "cannot be read: " in overview_page(one, load_pipeline(), tmp_path)
+
+
 @pytest.mark.parametrize("place", ["export/plates", "export/views/novel_left.exr", "work/sample_frames"])
 def test_no_picture_comes_from_elsewhere(result, tmp_path, place):
     copy = shutil.copytree(result, tmp_path / "anna")

@@ -13,6 +13,7 @@ from shared.errors import InputError
 from tools.cli.cases import SubjectCase
 from tools.cli.cluster import LOG_SUFFIX
 from tools.cli.gates import PICTURE, RECORD
+from tools.cli.overview import KEPT_PICTURES
 from tools.cli.plan import StagePlan
 from tools.cli.workflow import clear_leftovers
 
@@ -22,7 +23,7 @@ def removable(run: RunFolder, pipeline: Pipeline) -> list[Path]:
     names = tuple(pipeline.steps)
     paths = [run.work / name for name in names] + [run.failed(name) for name in names]
     paths += [run.stamp(name) for name in names] + [run.work / f"{name}{LOG_SUFFIX}" for name in names]
-    paths += [run.memory, *(run.work / name for name in ("workflow.log", RECORD, PICTURE))]
+    paths += [run.memory, *(run.work / name for name in ("workflow.log", RECORD, PICTURE, KEPT_PICTURES))]
     found = [path for path in paths if path.exists()]
     return found + [path for clip in run.clips() for path in removable(clip, pipeline)]
 

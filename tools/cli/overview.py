@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 from collections.abc import Mapping, Sequence
@@ -10,7 +11,8 @@ from urllib.parse import quote
 
 from shared.contract.declare import EXPORT, folder_of
 from shared.contract.folders import RunFolder
-from shared.contract.manifest import read_record
+from shared.contract.hashing import hash_value
+from shared.contract.manifest import read_record, write_record
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
 from shared.report.template import filled
@@ -23,6 +25,8 @@ from tools.cli.summary import ORDER
 
 TEMPLATES = Path(__file__).with_name("templates")
 FINISHED = ("review", "done")
+KEPT_PICTURES = "thumbnails.json"
+"""A finished subject's thumbnails in its work folder: reading its pictures takes ten times as long as all the rest."""
 
 
 def outcome_now(case: SubjectCase, pipeline: Pipeline, plans: Mapping[str, StagePlan]) -> Outcome:
@@ -121,10 +125,51 @@ def _pictures(outcome: Outcome, run: RunFolder | None) -> tuple[list[tuple[str, 
     """Thumbnails, (text, data URI) each, and why they cannot be read where they cannot."""
     if run is None:
         return [], ""
+    is_whole = outcome.state in FINISHED and _is_whole(outcome)
+    sources = _picture_files(run) if is_whole else ""
+    kept = _kept_pictures(run, sources) if is_whole else None
+    if kept is not None:
+        return kept, ""
     from tools.cli.thumbnails import PICTURE_ERRORS, crop_pictures, result_pictures
 
     try:
-        is_whole = outcome.state in FINISHED and _is_whole(outcome)
-        return list(result_pictures(run) if is_whole else crop_pictures(run)), ""
+        pictures = list(result_pictures(run) if is_whole else crop_pictures(run))
     except PICTURE_ERRORS as error:
         return [], str(error)
+    if is_whole:
+        _keep_pictures(run, sources, pictures)
+    return pictures, ""
+
+
+def _picture_files(run: RunFolder) -> str:
+    """Digest of the result's pictures and records, by name, size and time of change; links are not followed."""
+    export, facts = run.root / EXPORT, []
+    for folder in (export, export / "plates", export / "renders", export / "views"):
+        with contextlib.suppress(OSError), os.scandir(folder) as entries:
+            facts.append([folder.name, "", folder.lstat().st_mode, 0, 0])
+            for entry in entries:
+                status = entry.stat(follow_symlinks=False)
+                facts.append([folder.name, entry.name, status.st_mode, status.st_size, status.st_mtime_ns])
+    return hash_value(sorted(facts))
+
+
+def _kept_pictures(run: RunFolder, sources: str) -> list[tuple[str, str]] | None:
+    """The thumbnails that were kept of the same files; None where there are none."""
+    record = read_record(run.work / KEPT_PICTURES) or {}
+    pictures = record.get("pictures")
+    if record.get("sources") != sources or not isinstance(pictures, list):
+        return None
+    sound = [tuple(pair) for pair in pictures if isinstance(pair, list) and len(pair) == 2
+             and all(isinstance(part, str) for part in pair) and pair[1].startswith("data:image/jpeg;base64,")]
+    return sound if len(sound) == len(pictures) else None
+
+
+def _keep_pictures(run: RunFolder, sources: str, pictures: Sequence[tuple[str, str]]) -> None:
+    """Keeps them for the next page; results that nobody may write to are read again each time."""
+    temporary = run.work / f".{KEPT_PICTURES}.{os.getpid()}"
+    try:
+        write_record(temporary, {"sources": sources, "pictures": [list(pair) for pair in pictures]})
+        temporary.replace(run.work / KEPT_PICTURES)
+    except OSError:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
