@@ -4,7 +4,7 @@
 # make test-random  the tests in a random order; SEED=N: that order again
 # make test-files   each test file by itself
 # make setup   the set-up alone
-# make chart   set-up, then speed against accuracy on the embedded subject (15 minutes); CASES=all SUBJECT=DIR: more
+# make chart   set-up, then speed against accuracy on the embedded subject (10 minutes); CASES=all SUBJECT=DIR: more
 # make stress  set-up, then where Limn fails and whether it says so (an hour on one core; goes on where it was stopped)
 # make audit   licences, changed files, bill of materials; ADVISORIES=all.zip: known vulnerabilities, too
 PYTHON ?= python3

@@ -202,8 +202,8 @@ def test_a_result_is_scored_once_and_a_peer_has_a_row_for_each_of_its_seconds(be
     measure, calls, out = bench
     words = "--only", "standard", "matte", "Mitsuba", "--repeats", "2"
     content = measure(*words)
-    assert [row["case"] for row in content["rows"][:4]] == ["standard", "draft, matte", "Mitsuba, 45 s",
-                                                            "Mitsuba, 120 s"]
+    assert [row["case"] for row in content["rows"][:4]] == ["standard", "draft, matte", "Mitsuba, 30 s",
+                                                            "Mitsuba, 90 s"]
     assert [row["repeat"] for row in content["rows"]] == [0] * 4 + [1] * 4
     assert content["rows"][0]["scores"] == content["rows"][4]["scores"] != content["rows"][1]["scores"]
     assert measure(*words) == content and len(calls) == 6

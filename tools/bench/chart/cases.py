@@ -45,7 +45,7 @@ LIGHTENED = {
 }  # fmt: skip
 """The published algorithm, five to seven times cheaper per iteration and faster in its textures; mesh held still."""
 ITERATIONS = {"quick": (150, 450), "all": (150, 450, 1350, 4050)}
-PEER_SECONDS = {"quick": (45.0, 120.0), "all": (60.0, 120.0, 240.0, 480.0)}
+PEER_SECONDS = {"quick": (30.0, 90.0), "all": (60.0, 120.0, 240.0, 480.0)}
 
 
 @dataclass(frozen=True)
