@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -15,7 +17,8 @@ from shared.errors import InputError
 from shared.geometry.mesh import Mesh
 from shared.geometry.transforms import WORLD_FROM_CAMERA, project, rigid, vector_from_rotation, world_from_head
 from shared.imaging.texture import sample_bilinear
-from shared.io.images import read_png
+from shared.io.images import read_exr, read_png
+from shared.io.meshes import read_obj
 from shared.rendering import brdf
 from shared.rendering.envmap import latlong_directions
 from shared.tracking.models import load_face_networks
@@ -25,10 +28,10 @@ from tools.synthesis.head import DRIFT_DEG, YAW_DEG, head_turn
 from tools.synthesis.highlights import LobeSamples, sample_lobe, specular_radiance
 from tools.synthesis.irradiance import IrradianceQuality, SyntheticShot, assemble_atlas, group_irradiance
 from tools.synthesis.light import ENVIRONMENTS, EnvironmentLight, procedural_environment
-from tools.synthesis.output import ClipWriter, rounded, sensor_codes
+from tools.synthesis.output import ClipWriter, rounded, sensor_codes, write_scene_truth
 from tools.synthesis.render import RenderQuality, Scene, render
 from tools.synthesis.sampling import shifted_hammersley
-from tools.synthesis.subject import main
+from tools.synthesis.subject import PRESETS, light_of, main, procedural, synthesize
 from tools.synthesis.surface import Materials, SyntheticSurface
 
 FRONT = rigid(WORLD_FROM_CAMERA, np.array([0.0, 0.0, 950.0]))
@@ -272,6 +275,35 @@ def test_the_tiny_subject_is_what_the_tool_makes(networks, tmp_path):
     for path in sorted((TINY / "frames").glob("*.png")):
         difference = read_png(path).astype(int) - read_png(tmp_path / "tiny" / "frames" / path.name)
         assert np.abs(difference).mean() < 0.05, path.name
+
+
+def test_a_scan_takes_the_procedural_heads_place_and_burns_out_as_asked(tmp_path, networks):
+    head = procedural_subject(tmp_path / "head")
+    settings = replace(PRESETS["demo"], size=96, frames=8, seed=3, lights=("lamp",), clipped=0.3, scan=str(head),
+                       irradiance=IrradianceQuality(size=96, directions=256))
+    synthesize(tmp_path / "burnt", settings, 1)
+    truth, scanned = head / "gt", tmp_path / "burnt" / "gt"
+    assert np.allclose(read_obj(truth / "mesh.obj").vertices, read_obj(scanned / "mesh.obj").vertices, atol=1e-3)
+    assert np.allclose(read_exr(truth / "albedo.exr"), read_exr(scanned / "albedo.exr"), atol=1e-3)
+    stems = sorted(path.with_suffix("") for path in (scanned / "frames").glob("*_mask.png"))
+    assert len(stems) == 8
+    brightest = [read_exr(str(stem).replace("_mask", "_radiance") + ".exr").max(-1)[read_png(f"{stem}.png") > 127]
+                 for stem in stems]
+    assert 0.25 < (np.concatenate(brightest) >= 1.0).mean() < 0.35
+
+
+def procedural_subject(folder):
+    """The truth alone of a small procedural head."""
+    settings = replace(PRESETS["tiny"], texture=64)
+    mesh, _, materials = procedural(settings)
+    write_scene_truth(folder / "gt", Scene(mesh, materials, (light_of("lamp", settings),)), mesh, 10)
+    return folder
+
+
+def test_a_folder_without_a_scan_is_named(tmp_path, capsys):
+    assert main([str(tmp_path / "new"), "--scan", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert "holds no scan" in error and "mesh.obj" in error and not (tmp_path / "new").exists()
 
 
 def test_bad_arguments_are_one_line_and_exit_code_two(tmp_path, capsys):

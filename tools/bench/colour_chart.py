@@ -58,12 +58,12 @@ def measure(light: str, places: int, seed: int) -> np.ndarray:
     one = np.ones((4, 4), np.float32)
     surface = SyntheticSurface(head.mesh, Materials(one[..., None] * SKIN, one, one, one))
     environment = light_of(light, settings)
-    truth, shots = EXPOSURE * cube_from_latlong(environment, LIGHT_RESOLUTION), plan_shots(head, settings)
+    truth, shots = EXPOSURE * cube_from_latlong(environment, LIGHT_RESOLUTION), plan_shots(head.mesh, settings)
     camera = PinholeCamera(*SIZE, settings.focal_mm / SENSOR_MM * settings.size)
     rng = np.random.default_rng([seed, *light.encode()])
     said = []
     for k in range(places):
-        shot, chart = shots[rng.integers(settings.frames)], random_chart(*camera_place(head, settings), rng)
+        shot, chart = shots[rng.integers(settings.frames)], random_chart(*camera_place(head.mesh, settings), rng)
         picture = np.full((SIZE[1], SIZE[0], 3), 0.3)
         even = np.full((8, 8, 3), SKIN_IRRADIANCE * np.pi, np.float32)
         add_chart(picture, chart, surface, EnvironmentLight(environment), even, shot, camera.intrinsics, 3)

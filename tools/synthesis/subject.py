@@ -1,12 +1,14 @@
 """Make a head-turn clip whose every truth is known: the demo subject, and at tiny size the tests' subject.
 
     python -m tools.synthesize DEST [--preset demo|tiny] [--size 400] [--frames 48] [--light lamp] [--chart] ...
+    python -m tools.synthesize DEST --scan SUBJECT --light lamp --clipped 0.25
 
 Writes:  DEST/subject.yaml, capture.json, the clip (video.avi, or frames/%04d.png), synthesis.json (how it was made);
          gt/: mesh.obj, albedo.exr, specular.exr, roughness.exr, mask.exr (UV), envmap.exr, poses.npz, and for some
          frames frames/NNNN_*.exr and .png; relight/: the same head under other lights. tools/score.py reads all of it.
-Method:  a random head of the head model with procedural skin, bumps, bust and light; direct light with one diffuse
-         bounce and the GGX lobe, traced with embree (irradiance, camera); sensor noise, 8-bit sRGB.
+Method:  a random head of the head model with procedural skin, bumps and bust, or the scan of another subject; a
+         procedural light; direct light with one diffuse bounce and the GGX lobe, traced with embree (irradiance,
+         camera); sensor noise, 8-bit sRGB.
 The clip is FFV1 in AVI: of the encoders in OpenCV's wheel the lossy ones shift colours by 2 to 3 codes on their way
 through YUV 4:2:0, FFV1 returns every code value. The same arguments give the same bytes, whatever the number of
 processes.
@@ -25,6 +27,7 @@ import numpy as np
 from tqdm import tqdm
 
 from shared.errors import InputError
+from shared.geometry.mesh import Mesh
 from shared.geometry.transforms import rigid, rotation_from_vector, world_from_head
 from shared.io.arrays import save_arrays, write_json
 from shared.rendering.envmap import latlong_directions
@@ -33,11 +36,13 @@ from shared.tracking.models import load_head_model
 from tools.synthesis import output
 from tools.synthesis.camera import PictureQuality, PinholeCamera
 from tools.synthesis.chart import place_chart
-from tools.synthesis.head import PITCH_DEG, YAW_DEG, Head, face_part, head_turn, random_head
+from tools.synthesis.head import PITCH_DEG, YAW_DEG, face_part, head_turn, random_head
 from tools.synthesis.irradiance import IrradianceQuality, SyntheticShot
 from tools.synthesis.light import ENVIRONMENTS, procedural_environment
 from tools.synthesis.render import RenderQuality, Scene, render
+from tools.synthesis.scan import read_scan
 from tools.synthesis.skin import Complexion, SkinPainter
+from tools.synthesis.surface import Materials
 
 SENSOR_MM, FPS = 22.3, 25.0
 DISTANCE_PER_FOCAL = 950.0 / 60.0
@@ -48,6 +53,11 @@ WITH_CHART = 1.5
 """Width of a picture that holds a chart, relative to its height."""
 FACE_RADIANCE = 0.32
 """Mean linear radiance of the face, seen from the front, to which the exposure is set."""
+EXPOSURE_SIZE, EXPOSURE_VIEWS = 200, 3
+"""Pictures by which the light is set so that a share of the face burns out: how large, how many."""
+LEAST_IRRADIANCE = 0.8
+"""Texels of the irradiance per pixel along an edge, of a scan and in burning light: the edges of cast shadows are about
+as sharp as the pictures."""
 RELIGHT_YAWS_DEG = {"front": 0.0, "left15": -15.0, "right15": 15.0}
 
 
@@ -59,7 +69,8 @@ class SynthesisSettings:
     then those of relight/. truth_frames: how many frames get all buffers. mantissa_bits: precision of the truth on
     disk. face_truth_only: gt/mesh.obj holds the face without the rest of the head. chart: a colour chart stands beside
     the head, and the picture is half as wide again to hold it. specular_scale: factor on the specular intensity;
-    0: matte.
+    0: matte. clipped: share of the face's skin on which a channel burns out, over the clip; 0: the light is as bright
+    as FACE_RADIANCE says. scan: folder of a subject whose ground truth takes the procedural head's place.
     """
 
     size: int = 400
@@ -81,6 +92,8 @@ class SynthesisSettings:
     video: str = "video.avi"
     chart: bool = False
     specular_scale: float = 1.0
+    clipped: float = 0.0
+    scan: str | None = None
     irradiance: IrradianceQuality = IrradianceQuality()
     picture: PictureQuality = PictureQuality()
 
@@ -98,20 +111,21 @@ def synthesize(destination: Path, settings: SynthesisSettings, processes: int) -
     """Makes the subject in `destination`, which may not hold one yet. Errors: InputError."""
     if (destination / "subject.yaml").exists():
         raise InputError("holds a subject already", where=str(destination), hint="choose another folder or remove it")
-    head = random_head(head_model(settings.level), settings.seed, settings.eyes == "closed")
-    materials = SkinPainter(head, settings.texture, settings.seed).paint(Complexion(tone=settings.tone))
+    mesh, true_mesh, materials = scanned(settings) if settings.scan else procedural(settings)
     materials = replace(materials, specular=settings.specular_scale * materials.specular)
     lights = tuple(light_of(name, settings) for name in settings.lights)
-    distance, height = camera_place(head, settings)
+    distance, height = camera_place(mesh, settings)
     chart = place_chart(distance, height, settings.seed) if settings.chart else None
-    scene = Scene(head.mesh, materials, lights, chart)
+    shots = plan_shots(mesh, settings)
+    if settings.clipped:
+        gain = burning_gain(Scene(mesh, materials, lights[:1]), shots[:settings.frames], settings, processes)
+        lights = (np.float32(gain) * lights[0], *lights[1:])
+    scene = Scene(mesh, materials, lights, chart)
     width = round(WITH_CHART * settings.size) if settings.chart else settings.size
     camera = PinholeCamera(width, settings.size, settings.focal_mm / SENSOR_MM * settings.size)
-    shots = plan_shots(head, settings)
     truth = np.unique(np.linspace(0, settings.frames - 1, settings.truth_frames).round().astype(int))
     destination.mkdir(parents=True, exist_ok=True)
-    mesh = face_part(head) if settings.face_truth_only else head.mesh
-    output.write_scene_truth(destination / "gt", scene, mesh, settings.mantissa_bits)
+    output.write_scene_truth(destination / "gt", scene, true_mesh, settings.mantissa_bits)
     poses = np.stack([shot.camera_from_head for shot in shots[:settings.frames]])
     output.write_poses(destination / "gt" / "poses.npz", poses, camera, truth)
     with_buffers = [i in truth or i >= settings.frames for i in range(len(shots))]
@@ -126,6 +140,31 @@ def synthesize(destination: Path, settings: SynthesisSettings, processes: int) -
         destination, camera, focal_mm=settings.focal_mm, sensor_mm=SENSOR_MM * width / settings.size,
         frames=settings.frames, fps=FPS, video=settings.video,
     )
+
+
+def procedural(settings: SynthesisSettings) -> tuple[Mesh, Mesh, Materials]:
+    """A random head: its mesh, the part of it that the truth holds, its textures."""
+    head = random_head(head_model(settings.level), settings.seed, settings.eyes == "closed")
+    materials = SkinPainter(head, settings.texture, settings.seed).paint(Complexion(tone=settings.tone))
+    return head.mesh, face_part(head) if settings.face_truth_only else head.mesh, materials
+
+
+def scanned(settings: SynthesisSettings) -> tuple[Mesh, Mesh, Materials]:
+    """As procedural, of a scan."""
+    mesh, materials = read_scan(Path(settings.scan))
+    return mesh, mesh, materials
+
+
+def burning_gain(scene: Scene, shots: list[SyntheticShot], settings: SynthesisSettings, processes: int) -> float:
+    """The factor on the scene's light by which a channel of `settings.clipped` of the face's skin burns out, over a few
+    of the shots."""
+    chosen = [shots[i] for i in np.linspace(0, len(shots) - 1, EXPOSURE_VIEWS).round().astype(int)]
+    camera = PinholeCamera(EXPOSURE_SIZE, EXPOSURE_SIZE, settings.focal_mm / SENSOR_MM * EXPOSURE_SIZE)
+    coarse = replace(settings.irradiance, size=EXPOSURE_SIZE, directions=settings.irradiance.directions // 2)
+    quality = RenderQuality(coarse, settings.picture, settings.seed)
+    brightest = [images["radiance"].max(-1)[images["mask"] > 0.5]
+                 for images in render(scene, chosen, camera, quality, [True] * len(chosen), processes)]
+    return float(1.0 / np.quantile(np.concatenate(brightest), 1.0 - settings.clipped))
 
 
 def _write_clip(destination: Path, settings: SynthesisSettings, camera: PinholeCamera, truth: np.ndarray,
@@ -170,15 +209,15 @@ def light_of(name: str, settings: SynthesisSettings) -> np.ndarray:
     return (environment * (FACE_RADIANCE * np.pi / (irradiance * skin_albedo))).astype(np.float32)
 
 
-def camera_place(head: Head, settings: SynthesisSettings) -> tuple[float, float]:
+def camera_place(mesh: Mesh, settings: SynthesisSettings) -> tuple[float, float]:
     """The camera's distance from the head's origin and its height above it, mm."""
-    height = head.mesh.vertices[:, 1].max() + TOP_MARGIN_MM - 0.5 * SENSOR_MM * DISTANCE_PER_FOCAL
+    height = mesh.vertices[:, 1].max() + TOP_MARGIN_MM - 0.5 * SENSOR_MM * DISTANCE_PER_FOCAL
     return DISTANCE_PER_FOCAL * settings.focal_mm, height
 
 
-def plan_shots(head: Head, settings: SynthesisSettings) -> list[SyntheticShot]:
+def plan_shots(mesh: Mesh, settings: SynthesisSettings) -> list[SyntheticShot]:
     """The clip's frames, then three views under each further light."""
-    distance, height = camera_place(head, settings)
+    distance, height = camera_place(mesh, settings)
     poses = list(head_turn(settings.frames, distance, height, settings.seed, settings.yaw_deg, settings.pitch_deg))
     light = [0] * settings.frames
     for index in range(1, len(settings.lights)):
@@ -213,12 +252,16 @@ def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
     parser.add_argument("--noise", type=float, help="sensor noise at full scale, share of it")
     parser.add_argument("--specular", dest="specular_scale", type=float,
                         help="factor on the skin's specular intensity; 0: matte")
+    parser.add_argument("--clipped", type=float, help="share of the face's skin on which a channel burns out")
+    parser.add_argument("--scan", metavar="SUBJECT",
+                        help="subject whose ground truth takes the procedural head's place")
     parser.add_argument("--chart", action="store_true", help="a colour chart beside the head, in a wider picture")
     parser.add_argument("--processes", type=int, default=2, help="worker processes (default 2)")
     options = parser.parse_args(arguments)
     settings = PRESETS[options.preset]
     given = {name: getattr(options, name) for name in
-             ("size", "frames", "seed", "eyes", "tone", "noise", "focal_mm", "yaw_deg", "pitch_deg", "specular_scale")}
+             ("size", "frames", "seed", "eyes", "tone", "noise", "focal_mm", "yaw_deg", "pitch_deg", "specular_scale",
+              "clipped", "scan")}
     settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
     settings = replace(settings, chart=options.chart)
     if options.light:
@@ -230,10 +273,16 @@ def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
 def _checked(settings: SynthesisSettings) -> SynthesisSettings:
     for name, low, high in (("size", 64, 2048), ("frames", 8, 1000), ("seed", 0, 10**6), ("tone", 0.05, 2.0),
                             ("noise", 0.0, 0.1), ("focal_mm", 15.0, 500.0), ("yaw_deg", 0.0, 60.0),
-                            ("pitch_deg", 0.0, 40.0), ("specular_scale", 0.0, 2.0)):
+                            ("pitch_deg", 0.0, 40.0), ("specular_scale", 0.0, 2.0), ("clipped", 0.0, 0.9)):
         value = getattr(settings, name)
         if not low <= value <= high:
             raise InputError("out of range", where=f"--{name.split('_')[0]}", got=value, expected=f"{low} to {high}")
+    if settings.scan and settings.face_truth_only:
+        raise InputError("a scan is too large for it", where="--preset tiny", hint="use the preset demo")
+    if settings.scan or settings.clipped:
+        least = round(LEAST_IRRADIANCE * settings.size)
+        fine = replace(settings.irradiance, size=max(settings.irradiance.size, least))
+        settings = replace(settings, irradiance=fine)
     return settings
 
 

@@ -90,7 +90,7 @@ def render_scene(scene: StressScene, folder: Path, processes: int = 1) -> Path:
     if (done / "radiance.npy").exists():
         return done
     settings, truth, states, light = scene.settings, _truth_frames(scene), list(_states(scene)), _light(scene)
-    shots = plan_shots(states[0][0], settings)
+    shots = plan_shots(states[0][0].mesh, settings)
     if scene.on_head:
         shots = [replace(shot, world_from_head=np.eye(3)) for shot in shots]
     (done / "gt").mkdir(parents=True, exist_ok=True)
