@@ -5,7 +5,9 @@ Loads nothing but OpenCV and numpy: frames are looked at while the solver's libr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -16,6 +18,9 @@ DETAIL_SIGMA_PX = 1.2
 
 CRUSHED_CODE, CLIPPED_CODE = 8, 250
 """8-bit code values at and beyond which a pixel says nothing of the skin's texture."""
+
+GREEN_AND_BLUE = 0.84, 0.16
+"""Their shares of brightness where red is left out."""
 
 
 def local_contrast(grey: np.ndarray, sigma_px: float, spread_px: float, floor: float) -> np.ndarray:
@@ -29,10 +34,9 @@ def local_contrast(grey: np.ndarray, sigma_px: float, spread_px: float, floor: f
     return np.clip(np.rint(detail / spread * 45.0 + 128.0), 0, 255).astype(np.uint8)
 
 
-def unusable_pixels(rgb: np.ndarray) -> np.ndarray:
-    """[H, W, 3] uint8 -> [H, W] uint8, 1 where a channel is clipped or all are crushed, grown by two pixels."""
-    red, green, blue = cv2.split(rgb)
-    brightest = cv2.max(cv2.max(red, green), blue)
+def unusable_pixels(channels: Sequence[np.ndarray]) -> np.ndarray:
+    """Channels [H, W] uint8 each -> [H, W] uint8, 1 where one is clipped or all are crushed, grown by two pixels."""
+    brightest = reduce(cv2.max, channels)
     bad = (brightest >= CLIPPED_CODE) | (brightest <= CRUSHED_CODE)
     return cv2.dilate(bad.astype(np.uint8), np.ones((5, 5), np.uint8))
 
@@ -85,19 +89,38 @@ def face_width(landmarks_px: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class GreyFrame:
-    """What the pictures of a frame are made of: grey [H, W] uint8, and 1 where a pixel says nothing, [H, W] uint8."""
+    """What the pictures of a frame are made of: grey [H, W] uint8, and 1 where a pixel says nothing, [H, W] uint8.
+
+    Skin's red burns out first, and with it what could be tracked. Where red alone is clipped green and blue stand in:
+    cool [H, W] uint8 is their mixture, red_clipped [H, W] bool where it serves; None where no pixel needs it.
+    """
 
     grey: np.ndarray
     unusable: np.ndarray
+    cool: np.ndarray | None = None
+    red_clipped: np.ndarray | None = None
 
     @classmethod
     def of(cls, rgb: np.ndarray, background: np.ndarray) -> GreyFrame:
         """From [H, W, 3] uint8 and background [H, W] bool."""
-        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        return cls(grey, unusable_pixels(rgb) | background.astype(np.uint8))
+        grey, (red, green, blue) = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.split(rgb)
+        unusable = unusable_pixels((red, green, blue))
+        still_unusable = unusable_pixels((green, blue))
+        red_clipped = (unusable > still_unusable) & ~background
+        if not red_clipped.any():
+            return cls(grey, unusable | background.astype(np.uint8))
+        cool = cv2.addWeighted(green, GREEN_AND_BLUE[0], blue, GREEN_AND_BLUE[1], 0.0)
+        unusable[red_clipped] = 0
+        return cls(grey, unusable | background.astype(np.uint8), cool, red_clipped)
 
     def contrast(self, face_width_px: float) -> tuple[np.ndarray, np.ndarray]:
         """The wide contrast of the skin and its finest detail, [H, W] uint8 each."""
         sigma = float(np.clip(face_width_px / 55.0, 2.5, 12.0))
-        wide = local_contrast(self.grey, sigma, 1.5 * sigma, 0.02)
-        return wide, local_contrast(self.grey, DETAIL_SIGMA_PX, 2.25 * DETAIL_SIGMA_PX, 0.05)
+        return self._contrast(sigma, 1.5 * sigma, 0.02), self._contrast(DETAIL_SIGMA_PX, 2.25 * DETAIL_SIGMA_PX, 0.05)
+
+    def _contrast(self, sigma_px: float, spread_px: float, floor: float) -> np.ndarray:
+        """Local contrast, of green and blue where red is clipped."""
+        picture = local_contrast(self.grey, sigma_px, spread_px, floor)
+        if self.cool is not None:
+            np.copyto(picture, local_contrast(self.cool, sigma_px, spread_px, floor), where=self.red_clipped)
+        return picture

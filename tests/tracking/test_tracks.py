@@ -1,5 +1,6 @@
 """Dense tracks on a textured plane that turns before the camera, where each point's place is known."""
 
+import cv2
 import numpy as np
 from shapes import turned
 from toy_plane import LENS, PLANE, SIZE, plane_texture, see_plane
@@ -7,7 +8,7 @@ from toy_plane import LENS, PLANE, SIZE, plane_texture, see_plane
 from shared.geometry.mesh import vertex_normals
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import project, rigid
-from shared.tracking.tracked_clip import local_contrast, unusable_pixels
+from shared.tracking.tracked_clip import GreyFrame, local_contrast, unusable_pixels
 from shared.tracking.tracks import (
     dense_tracks,
     grid_from_landmarks,
@@ -90,9 +91,32 @@ def test_clipped_and_crushed_pixels_are_unusable():
     image = np.full((20, 20, 3), 120, np.uint8)
     image[5, 5] = 255
     image[14, 14] = 3
-    bad = unusable_pixels(image)
+    bad = unusable_pixels(cv2.split(image))
     assert bad[3:8, 3:8].all() and bad[12:17, 12:17].all()
     assert bad.sum() == 50
+
+
+def test_green_and_blue_stand_in_where_red_alone_is_clipped():
+    skin = np.stack([np.full((128, 128), 255.0), 0.8 * texture(128), 0.5 * texture(128)], axis=2)
+    frame = GreyFrame.of(np.uint8(skin.clip(0, 255)), np.zeros((128, 128), bool))
+    red = np.stack([skin[..., 1]] * 3, axis=2)
+    unclipped = GreyFrame.of(np.uint8(red.clip(0, 255)), np.zeros((128, 128), bool))
+    assert not frame.unusable.any() and frame.red_clipped.all()
+    assert unclipped.cool is None and unclipped.red_clipped is None
+    for found, expected in zip(frame.contrast(200.0), unclipped.contrast(200.0), strict=True):
+        assert np.corrcoef(found.ravel().astype(float), expected.ravel().astype(float))[0, 1] > 0.95
+
+
+def test_a_pixel_of_two_clipped_channels_or_of_the_background_says_nothing():
+    image = np.full((40, 40, 3), 120, np.uint8)
+    image[10, 10] = 255, 255, 120
+    image[30, 30, 0] = 255
+    background = np.zeros((40, 40), bool)
+    background[:, 30:] = True
+    frame = GreyFrame.of(image, background)
+    assert frame.unusable[8:13, 8:13].all() and frame.unusable[:, 30:].all()
+    assert frame.unusable[28:33, 28:30].sum() == 0
+    assert frame.red_clipped.sum() == 5 * 2
 
 
 def test_local_contrast_ignores_gain():
