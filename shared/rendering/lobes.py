@@ -19,22 +19,25 @@ import numpy as np
 
 from shared.compute.compiled import compiled, compiled_part
 from shared.rendering.brdf import F0, MINIMUM_COSINE
+from shared.rendering.direction_set import widest_spacing
 from shared.rendering.split_sum import SplitSum, narrowest_roughness
 
 _POINTS_PER_BLOCK = 512
 
 
 class SpecularTransfer:
-    """What the lobes of P points share over all views: cosines with J directions and visibility.
+    """What the lobes of P points share over all views: J directions, also as the loops want them, and visibility.
 
-    normals [P, 3], visible [P, J] bool (as Transfer.visibility), directions [J, 3] uniform over the sphere.
+    normals [P, 3], visible [P, J] bool (as Transfer.visibility), directions [J, 3]: a direction_set.
     """
 
     def __init__(self, normals: np.ndarray, visible: np.ndarray, directions: np.ndarray):
         self.normals = np.ascontiguousarray(normals, np.float32)
-        self.directions = np.ascontiguousarray(directions.T, np.float32)
+        self.directions = directions
+        size = np.linalg.norm(directions, axis=1)
+        self.rows = np.ascontiguousarray(np.c_[directions / size[:, None], size].T, np.float32)
         self.visible = np.ascontiguousarray(visible)
-        self.narrowest = narrowest_roughness(len(directions))
+        self.narrowest = narrowest_roughness(widest_spacing(directions))
         self._split_sum: SplitSum | None = None
 
     def take(self, index: np.ndarray) -> SpecularTransfer:
@@ -59,7 +62,7 @@ class SpecularTransfer:
     def split_sum(self, part: slice, towards: np.ndarray, roughness: float) -> tuple[np.ndarray, np.ndarray]:
         """Weights of narrow lobes: all directions [p, J], and the open share [p, J]. towards [p, 3] unit."""
         if self._split_sum is None:
-            self._split_sum = SplitSum(self.directions.T.astype(np.float64))
+            self._split_sum = SplitSum(self.directions)
         return self._split_sum.kernel(self.normals[part], towards, float(roughness), self.visible[part])
 
     def alpha2(self, roughness: float | np.ndarray) -> np.ndarray:
@@ -85,7 +88,7 @@ def specular_reflection(
     if table.resolves(roughness):
         channels = np.ascontiguousarray(light.T)
         _sum_lobes(
-            table.normals, towards, table.alpha2(roughness), table.directions, table.visible, channels, result, blocked
+            table.normals, towards, table.alpha2(roughness), table.rows, table.visible, channels, result, blocked
         )
     else:
         for part in blocks_of(table):
@@ -101,9 +104,10 @@ def blocks_of(table: SpecularTransfer) -> list[slice]:
 
 @compiled_part
 def weigh_directions(normal, towards, alpha2, directions, weights):
-    """One point's lobe on all directions [3, J] -> weights [J]: brdf.specular_cosine times the solid angle.
+    """One point's lobe on all directions -> weights [J]: brdf.specular_cosine times the solid angle. directions [4, J]:
+    unit vectors and their relative solid angles.
 
-    D's alpha^2 / pi, both masking terms' factor 2, the denominator's 4 cos_o and the solid angle 4 pi / J make up the
+    D's alpha^2 / pi, both masking terms' factor 2, the denominator's 4 cos_o and the solid angle's 4 pi / J make up the
     common factor, with the masking of the outgoing direction.
     """
     one, half, least = np.float32(1.0), np.float32(0.5), np.float32(1e-6)
@@ -121,7 +125,7 @@ def weigh_directions(normal, towards, alpha2, directions, weights):
         fresnel = np.float32(F0) + np.float32(1.0 - F0) * away * away * away * away * away
         cos_i = max(n_dot_i, np.float32(0.0))
         masking = np.sqrt(cos_i * cos_i * (one - alpha2) + alpha2) + cos_i
-        weights[j] = factor * fresnel * cos_i / (masking * base * base)
+        weights[j] = directions[3, j] * (factor * fresnel * cos_i / (masking * base * base))
 
 
 @compiled_part

@@ -24,8 +24,8 @@ class Sizes:
 
 @dataclass(frozen=True)
 class PrecomputedTransfer:
-    """What does not depend on the frames: directions [J, 3], bounce nodes and their transfer, whether parts of the
-    head cover each other."""
+    """What does not depend on the frames: directions [J, 3] (a direction_set), bounce nodes and their transfer, whether
+    parts of the head cover each other."""
 
     scene: RayScene
     directions: np.ndarray
@@ -40,9 +40,12 @@ class PrecomputedTransfer:
         )
 
 
-def precompute_transfer(viewer: SurfaceViewer, sizes: Sizes, visibility: bool = True) -> PrecomputedTransfer:
-    """Directions and bounce nodes of a mesh, traced; visibility off: see trace_transfer."""
-    directions = fibonacci_sphere(sizes.directions)
+def precompute_transfer(
+    viewer: SurfaceViewer, sizes: Sizes, visibility: bool = True, directions: np.ndarray | None = None
+) -> PrecomputedTransfer:
+    """Bounce nodes of a mesh, traced along directions [J, 3], or along an even set; visibility off: see trace_transfer.
+    """
+    directions = fibonacci_sphere(sizes.directions) if directions is None else directions
     nodes = bounce_nodes(viewer.mesh, sizes.nodes, viewer.layout)
     node_transfer = trace_transfer(viewer.scene, nodes.points, nodes, directions, visibility=visibility)
     return PrecomputedTransfer(viewer.scene, directions, nodes, node_transfer, visibility)

@@ -29,7 +29,7 @@ def specular_tables(
     """
     def tabulate(view: np.ndarray, bits: np.ndarray, blocked: np.ndarray) -> None:
         alpha2 = table.alpha2(roughness)
-        _tabulate_lobes(table.normals, view, alpha2, table.directions, table.visible, bits, blocked)
+        _tabulate_lobes(table.normals, view, alpha2, table.rows, table.visible, bits, blocked)
 
     def split(part: slice, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return table.split_sum(part, view, roughness)
@@ -44,7 +44,7 @@ def specular_slopes(table: SpecularTransfer, towards: np.ndarray, roughness: flo
 
     def tabulate(view: np.ndarray, bits: np.ndarray, blocked: np.ndarray) -> None:
         narrower, wider = (table.alpha2(end) for end in ends)
-        _tabulate_slopes(table.normals, view, narrower, wider, table.directions, table.visible, bits, blocked)
+        _tabulate_slopes(table.normals, view, narrower, wider, table.rows, table.visible, bits, blocked)
 
     def split(part: slice, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         narrower, wider = (table.split_sum(part, view, end) for end in ends)
@@ -59,7 +59,7 @@ def _of_all_views(
     """tabulate: fills one view's table where the directions resolve the lobes; split: weights of a part of the points
     on all directions and on the open ones, where they do not."""
     points, frames = towards.shape[:2]
-    bits = np.empty((frames, points, table.directions.shape[1]), np.int16)
+    bits = np.empty((frames, points, len(table.directions)), np.int16)
     weights = torch.from_numpy(bits).view(torch.bfloat16)
     blocked = np.zeros((frames, points), np.float32)
 

@@ -27,12 +27,12 @@ _POINTS_PER_BLOCK = 256
 _COSINES = (np.arange(64) + 0.5) / 64
 
 
-def narrowest_roughness(count: int) -> float:
-    """Roughness below which lobes slip between count directions: alpha under 0.48 of their spacing sqrt(4 pi / count).
+def narrowest_roughness(spacing: float) -> float:
+    """Roughness below which lobes slip between directions: alpha under 0.48 of their spacing, radians.
 
     768 directions: 0.25. The errors of the two ways cross there: earlier beside an occluder, later in the open.
     """
-    return float((0.48 * np.sqrt(4.0 * np.pi / count)) ** 0.5)
+    return float((0.48 * spacing) ** 0.5)
 
 
 def sample_half_vectors(roughness: float, count: int = SAMPLES) -> np.ndarray:
@@ -67,9 +67,9 @@ class SplitSum:
 
     def __init__(self, directions: np.ndarray):
         self.directions = directions
-        texels = cube_directions(_TABLE_RESOLUTION)
-        distance, nearest = cKDTree(directions).query(texels, k=_NEIGHBOURS)
-        share = np.maximum(1.2 * distance[:, -1:] - distance, 0.0)
+        texels, size = cube_directions(_TABLE_RESOLUTION), np.linalg.norm(directions, axis=1)
+        distance, nearest = cKDTree(directions / size[:, None]).query(texels, k=_NEIGHBOURS)
+        share = np.maximum(1.2 * distance[:, -1:] - distance, 0.0) * size[nearest]
         self._nearest, self._share = nearest, share / share.sum(1, keepdims=True)
         self._integrals: dict[float, np.ndarray] = {}
 

@@ -155,7 +155,7 @@ def trace_transfer(
 ) -> Transfer:
     """Traces every direction above each point's horizon, once.
 
-    directions [J, 3] unit, uniform (each 4 pi / J sr); progress: wraps the sequence of batches to show how far it is;
+    directions [J, 3]: a direction_set; progress: wraps the sequence of batches to show how far it is;
     visibility off: every point sees all directions above its horizon, as on a convex surface, and nothing bounces.
     """
     count, total = len(points), len(directions)

@@ -7,10 +7,12 @@ from quadrature import hemisphere_quadrature
 from shared.geometry.mesh import normalised
 from shared.geometry.transforms import fibonacci_sphere
 from shared.rendering.brdf import directional_albedo, microfacet_integrals, specular_cosine
+from shared.rendering.direction_set import widest_spacing
 from shared.rendering.lobes import SpecularTransfer, specular_reflection
 from shared.rendering.split_sum import SplitSum, frames_about, narrowest_roughness, sample_half_vectors
 
 DIRECTIONS = fibonacci_sphere(768)
+SPACING = widest_spacing(DIRECTIONS)
 UP = np.array([0.0, 0.0, 1.0])
 COSINES = np.array([0.35, 0.5, 0.8, 1.0])
 TOWARDS = np.stack([np.sqrt(1 - COSINES**2), 0 * COSINES, COSINES], axis=1)
@@ -86,7 +88,7 @@ def test_the_way_that_is_chosen_is_near_the_integral(roughness, covered):
     """Open surfaces to 6 %; beside an occluder, where averaging apart costs the split sum most, to 15 % of the open."""
     expected, scale = brute_force(roughness, covered), brute_force(roughness, False)
     by_split, by_sum = both_ways(roughness, covered)
-    chosen = by_split if roughness < narrowest_roughness(768) else by_sum
+    chosen = by_split if roughness < narrowest_roughness(SPACING) else by_sum
     assert (np.abs(chosen - expected) / scale).max() < (0.15 if covered else 0.06)
 
 
@@ -97,8 +99,8 @@ def test_each_way_is_the_better_one_on_its_side():
     split_wide, sum_wide = both_ways(0.7, True)
     assert np.abs(split_narrow / narrow - 1).max() < 0.05 < np.abs(sum_narrow / narrow - 1).max()
     assert np.abs(sum_wide / wide - 1).max() < 0.03 < np.abs(split_wide / wide - 1).max()
-    assert narrowest_roughness(768) == pytest.approx(0.25, abs=0.01)
-    assert narrowest_roughness(4096) < narrowest_roughness(768)
+    assert narrowest_roughness(SPACING) == pytest.approx(0.25, abs=0.01)
+    assert narrowest_roughness(0.5 * SPACING) < narrowest_roughness(SPACING)
 
 
 def test_half_vectors_follow_the_distribution():
