@@ -9,6 +9,8 @@ Method   What no track reaches (ears, skull, jaw) moves until the mesh's outline
          stopping on held-out frames; a prior on how skin varies over a face keeps the colours of a room out of the
          albedo. Under that light the mesh is refined from parallax and shading by
          Gauss-Newton, coarse to fine, the light solved anew, and the refined mesh kept if held-out frames fit better.
+         On it all frames are tracked again; where that turns the poses by what matters, mesh and light follow from the
+         new ones. Light is summed along directions that lie close where a small lamp passes.
          Or (model=auto) the model is chosen first, on few points and frames: shared/selection/candidates.py. Then
          albedo and specular intensity per texel in closed form, streaming over the frames; samples where a cast shadow
          ends, which the mesh tells to millimetres only, count less. The solver starts from a uniform light and the
@@ -62,7 +64,7 @@ PUBLISHED = ParameterGroup(
 
 STAGE = Stage(
     name="inverse_render",
-    version=21,
+    version=22,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -130,6 +132,8 @@ STAGE = Stage(
                   "surface moves together.", "", 0.0, 10000.0),
         Parameter("shape_sigma", float, 8.0, "Expected distance of the tracked mesh from the truth where it is wrong "
                   "as a whole.", "mm", 0.01, 100.0, former="shape_spread"),
+        Parameter("pose_rounds", int, 3, "Times, at most, that the frames are tracked again on the refined mesh; 0: "
+                  "the tracked poses stay.", "", 0, 10),
         Parameter("normal_map", bool, True, "Solve relief finer than the mesh as a normal map; else it is flat."),
         Parameter("render_count", int, 8, "Frames to re-render, spread evenly.", "frames", 1, 2000),
         Parameter("mesh", str, "", "Mesh (.npz or .obj) to use instead of the tracked one; empty: tracked.",
@@ -163,11 +167,11 @@ def write_maps(job: Job, result) -> None:
         write_exr(job.out / "maps" / f"{name}.exr", image, colour_space=colour_space, attributes=attributes)
 
 
-def write_clip(job: Job, folder: Path, clip, first: int, result, light, poses) -> dict:
+def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
     """envmap.exr, poses.npz and renders/%06d.exr of a clip -> which frames of its source were re-rendered, which held
     out.
 
-    clip: its ClipInputs; first: of its frames, among all that were solved; light [6 n^2, 3]; poses [F, 4, 4].
+    clip: its ClipInputs; first: of its frames, among all that were solved; light [6 n^2, 3].
     """
     from shared.imaging.frame_index import spread_frames
     from shared.io.arrays import save_arrays
@@ -179,9 +183,12 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light, poses) -
     latlong = latlong_from_cube(light, LATLONG_HEIGHT)
     write_exr(folder / "envmap.exr", latlong, colour_space="lin_rec709_scene", latlong=True)
     frames, index = clip.frames, clip.frame_index
+    poses = result.views.camera_from_head[first : first + len(index)]
+    covariance = {} if result.covariance is None else {"covariance": result.covariance}
     save_arrays(
         folder / "poses.npz",
         camera_from_head=poses,
+        **covariance,
         frame_index=index,
         intrinsics=frames.intrinsics_source,
         intrinsics_crop=frames.intrinsics,
@@ -191,7 +198,7 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light, poses) -
     for f in job.progress(chosen, "re-rendering"):
         image, _ = render_frame(result.viewer, result.shading, maps, first + f, poses[f], clip.lens, clip.views.size)
         write_exr(folder / "renders" / f"{index[f]:06d}.exr", image, colour_space="lin_rec709_scene")
-    held_out = index[~result.fitted[first : first + len(index)]]
+    held_out = index[~result.views.fitted[first : first + len(index)]]
     return {"render_frames": index[chosen].tolist(), "held_out_frames": held_out.tolist()}
 
 
@@ -248,7 +255,8 @@ def run(job: Job) -> None:
     observations = inputs.chart_observations() if job.params.chart else ()
     settings = read_settings(job.params, job.out.parent / CHECKPOINT)
     views, surface = inputs.views, inputs.surface
-    result = solve_clip(views, surface, settings, RunContext(job.progress, job.note), observations)
+    tracked = None if job.clips else inputs.tracked
+    result = solve_clip(views, surface, settings, RunContext(job.progress, job.note), observations, tracked)
     record = summarise(result, views.moves)
     record["warnings"] += [f"clip {clip['name']} lies {clip['match_px']:.1f} px beside the shared mesh: other lens, "
                            "another expression?" for clip in placed if clip.get("match_px", 0.0) > FAR_PX]
@@ -259,7 +267,7 @@ def run(job: Job) -> None:
     lights, own = np.split(result.solution.state.light, len(clips)), []
     for k, (clip, rows) in enumerate(zip(clips, views.frames_of_lights, strict=True)):
         folder = job.out / "clips" / job.clips[k] if k else job.out
-        own.append(write_clip(job, folder, clip, rows[0], result, lights[k], views.camera_from_head[rows]))
+        own.append(write_clip(job, folder, clip, rows[0], result, lights[k]))
     record |= own[0]
     if job.clips:
         record["clips"] = [clip | frames for clip, frames in zip(placed, own, strict=True)]

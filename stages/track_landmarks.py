@@ -63,6 +63,7 @@ def look_at_frames(job: Job, frames):
     """Each frame read once -> landmarks [F, 468, 2] px and presence [F], by the networks or of the given file, and the
     F grey frames that the pictures for tracking are made of."""
     from shared.compute.parallel import in_order
+    from shared.imaging.color import eight_bit
     from shared.tracking.given_tracking import read_given_landmarks
     from shared.tracking.models import own_face_networks
     from shared.tracking.tracked_clip import GreyFrame
@@ -88,11 +89,6 @@ def look_at_frames(job: Job, frames):
         if previous is not None:
             points[i] = previous[:, :2]
     return points, presence, greys
-
-
-def eight_bit(codes: np.ndarray) -> np.ndarray:
-    """uint8 or uint16 code values -> uint8."""
-    return codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8)
 
 
 def build_clip(job: Job, frames, greys: list, used: np.ndarray, landmarks_px: np.ndarray, given_poses):
@@ -187,6 +183,7 @@ def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[d
             "gain": round(track.focal_gain, 5),
             "log_deviation": round(track.focal_deviation, 5),
         },
+        "held": job.subject.hold_poses,
         "scale": "fixed by the head model's mean size and identity prior",
         "identity": [round(float(code), 4) for code in track.fit.identity],
         "expression": [round(float(code), 4) for code in track.fit.expression],
@@ -196,6 +193,7 @@ def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[d
 def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> None:
     """Writes all outputs."""
     from shared.geometry.mesh import Mesh
+    from shared.imaging.color import eight_bit
     from shared.io.arrays import save_arrays, write_json
     from shared.io.images import write_png
     from shared.io.meshes import save_mesh

@@ -62,9 +62,11 @@ FRAMES = (
     Field("warnings", "What is wrong with the clip, one sentence each.", "text", "N"),
 )
 
+COVARIANCE = Field("covariance", "Covariance of each pose: rotation (radians), then translation (mm).", "float64",
+                   "F, 6, 6")
 TRACKED_POSES = (
     POSES,
-    Field("covariance", "Covariance of each pose: rotation (radians), then translation (mm).", "float64", "F, 6, 6"),
+    COVARIANCE,
     FRAME_INDEX,
     SOURCE_LENS,
     CROP_LENS,
@@ -111,6 +113,7 @@ TRACKING = (
     Field("focal.solved", "Whether the result uses the tracks' focal length (it was not given).", "bool"),
     Field("focal.gain", "The focal length that the tracks ask for, relative to the one of `frames.json`."),
     Field("focal.log_deviation", "Standard deviation of the logarithm of that."),
+    Field("held", "Whether the poses were given and stay as they are.", "bool"),
     Field("scale", "What fixes the overall size.", "text"),
     Field("identity", "The head model's identity coefficients.", shape="N"),
     Field("expression", "Its expression coefficients.", shape="M"),
@@ -128,7 +131,7 @@ INIT = (
     Field("seen_share", "Share of the head's texels that the frames show."),
 )
 
-SOLVED_POSES = (POSES, FRAME_INDEX, SOURCE_LENS, CROP_LENS)
+SOLVED_POSES = (POSES, replace(COVARIANCE, optional=True), FRAME_INDEX, SOURCE_LENS, CROP_LENS)
 _REFERENCE = "solver=reference only:"
 _CANDIDATES = (
     Field("part", "Part of the model.", "text"),
@@ -210,6 +213,16 @@ SOLVE = (
     Field("shape.outline.held_out_px", "Mean distance in held-out frames.", "", optional=True),
     Field("shape.outline.held_out_px.before", "Before.", unit="px"),
     Field("shape.outline.held_out_px.after", "After.", unit="px"),
+    Field("poses", "The poses tracked again on the refined mesh; empty where that was not tried, absent with "
+          "solver=reference.", "", optional=True),
+    Field("poses.kept", "Whether the new poses were kept: they differ by what matters, and tracks kept aside fit them "
+          "better.", "bool", optional=True),
+    Field("poses.held_out_px", "Median distance of tracks that were kept aside.", "", optional=True),
+    Field("poses.held_out_px.before", "Before.", unit="px"),
+    Field("poses.held_out_px.after", "After.", unit="px"),
+    Field("poses.rounds_deg", "How far the poses turned each time that the frames were tracked, rms.", shape="N",
+          unit="deg", optional=True),
+    Field("poses.turned_deg", "How far they turned in all, rms.", unit="deg", optional=True),
     Field("relief", "The normal map; empty with normal_map=false, absent with solver=reference.", "", optional=True),
     Field("relief.prior_radians", "Expected size of the turns.", unit="rad", optional=True),
     Field("relief.confirmed_share", "Share of the turns that held-out frames confirm.", optional=True),

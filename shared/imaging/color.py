@@ -23,6 +23,11 @@ _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0
 WHITE_D65 = np.array([0.95047, 1.0, 1.08883])
 
 
+def eight_bit(codes: np.ndarray) -> np.ndarray:
+    """uint8 or uint16 code values -> uint8."""
+    return codes if codes.dtype == np.uint8 else (codes >> 8).astype(np.uint8)
+
+
 def decode_srgb(codes: np.ndarray) -> np.ndarray:
     """sRGB code values in [0, 1] -> linear."""
     return np.where(codes <= 0.04045, codes / 12.92, ((np.maximum(codes, 0.0) + 0.055) / 1.055) ** 2.4)

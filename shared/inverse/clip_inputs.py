@@ -8,27 +8,32 @@ from pathlib import Path
 import numpy as np
 
 from shared.capture.chart import ChartObservation
+from shared.compute.parallel import in_order
 from shared.errors import InputError
 from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface, TrackPoints
-from shared.imaging.color import decode_transfer
+from shared.imaging.color import decode_transfer, eight_bit
 from shared.imaging.image_sampling import Picture, prepare_picture
 from shared.imaging.views import Views
+from shared.inverse.pose_rounds import TrackedPoses
 from shared.inverse.texture_match import ClipTexture
 from shared.io.arrays import load_arrays, read_json
 from shared.io.frames import FrameSet
 from shared.io.images import read_exr
 from shared.io.meshes import load_mesh, read_obj
+from shared.tracking.tracked_clip import GreyFrame, TrackedClip
 
 
 @dataclass(frozen=True, eq=False)
 class ClipInputs:
-    """A clip's views and surface; frames: its sampled frames on disk, place [F]: where among them each view is."""
+    """A clip's views and surface; frames: its sampled frames on disk, place [F]: where among them each view is;
+    tracked: what its poses can be tracked from again, None where they were given."""
 
     views: Views
     surface: Surface
     frames: FrameSet
     place: np.ndarray
+    tracked: TrackedPoses | None = None
 
     @property
     def frame_index(self) -> np.ndarray:
@@ -63,7 +68,7 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
     path = Path(mesh_path) if mesh_path else tracked / "mesh.npz"
     mesh = read_obj(path) if path.suffix == ".obj" else load_mesh(path)
     segment = load_arrays(path).get("face_segment") if path.suffix == ".npz" else None
-    names = tuple(read_json(tracked / "tracking.json")["segments"])
+    tracking = read_json(tracked / "tracking.json")
     poses = load_arrays(Path(pose_path)) if pose_path else tracked_poses
     points = None if mesh_path or pose_path else load_arrays(tracked / "tracks.npz")
     tracks = None if points is None else TrackPoints.tracked(points["points_head"], points["sigma_mm"])
@@ -76,7 +81,25 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
         read_picture=lambda f: read_picture(frames, int(place[f])),
         read_mask=lambda f: frames.read_mask(int(place[f])),
     )
-    return ClipInputs(views, Surface(mesh, segment, names, tracks), frames, place)
+    surface = Surface(mesh, segment, tuple(tracking["segments"]), tracks)
+    if tracks is None or tracking["held"]:
+        return ClipInputs(views, surface, frames, place)
+    again = TrackedPoses(lambda: look_again(frames, place), tracked_poses["covariance"])
+    return ClipInputs(views, surface, frames, place, again)
+
+
+def look_again(frames: FrameSet, place: np.ndarray) -> TrackedClip:
+    """The frames place [F] as fine tracking sees them."""
+
+    def look(i: int) -> tuple[np.ndarray, np.ndarray]:
+        grey = GreyFrame.of(eight_bit(frames.read_codes(i)), frames.read_mask(i) == 0)
+        return grey.detail(), grey.unusable
+
+    detail, unusable = (list(kind) for kind in zip(*in_order(look, place), strict=True))
+    no_landmarks = np.empty((len(place), 0, 2))
+    return TrackedClip(
+        detail, detail, unusable, no_landmarks, frames.time_s[place], frames.intrinsics, frames.size
+    )
 
 
 def read_picture(frames: FrameSet, i: int) -> Picture:

@@ -61,6 +61,7 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         shape=shape if params.shape else None,
         fit_frames=params.fit_frames,
         normal_map=params.normal_map,
+        pose_rounds=params.pose_rounds,
         reference=read_reference(params, checkpoint) if params.solver == "reference" else None,
         selection=read_forced(params.fixed_parts) if params.model == "auto" else None,
     )

@@ -34,7 +34,8 @@ class InverseSettings:
     shape: how the mesh is refined, None: it stays as it is; fit_frames: how many frames to fit, chosen to cover the
     face, 0: all but those held out; reference: solve by the published algorithm instead; selection: choose the model,
     up to what the settings say, and leave only the named parts of it as they say; specular_widths: over which, relative
-    to the map, texels share their specular intensity: what held-out frames choose from."""
+    to the map, texels share their specular intensity: what held-out frames choose from; pose_rounds: how often, at
+    most, the frames are tracked again on the refined mesh."""
 
     sizes: Sizes = field(default_factory=Sizes)
     appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
@@ -47,20 +48,23 @@ class InverseSettings:
     normal_map: bool = True
     selection: frozenset[str] | None = None
     specular_widths: tuple[float, ...] = (np.inf, 1 / 16, 1 / 64)
+    pose_rounds: int = 3
 
 
 @dataclass(frozen=True)
 class InverseResult:
     """solution of the appearance fit, the texels' material, maps by name, the vertices' shading in all views, the
-    viewer of the final mesh, which views were fitted [F] bool, and what is worth recording."""
+    viewer of the final mesh, the views with their poses and which were fitted, and what is worth recording; covariance
+    [F, 6, 6] of poses that were tracked again, None: they are as they were given."""
 
     solution: Solution
     material: TexelMaterial
     maps: dict[str, np.ndarray]
     shading: VertexShading
     viewer: SurfaceViewer
-    fitted: np.ndarray
+    views: Views
     record: dict
+    covariance: np.ndarray | None = None
 
 
 def some_views(views: Views, settings: InverseSettings, wanted: int) -> Views:

@@ -185,7 +185,7 @@ def conclude(
         "albedo_scale": describe_scale(None, np.median(state.albedo, axis=0)) | {"method": SCALE},
         "warnings": [],
     }
-    return InverseResult(solution, material, maps, shading, viewer, views.fitted, record)
+    return InverseResult(solution, material, maps, shading, viewer, views, record)
 
 
 def map_material(solver: ReferenceSolver, average: Average) -> TexelMaterial:

@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from shared.appearance.chart_scale import ChartStatement, describe_scale, scale_warnings, state_chart
+from shared.appearance.chart_scale import describe_scale, scale_warnings, state_chart
 from shared.appearance.diagnostics import diagnostic_warnings, diagnostics_of, face_regions
 from shared.appearance.fine_normals import NormalPass, resolved_texels
 from shared.appearance.fit import Solution, fit_all_points, fit_appearance
 from shared.appearance.light_models import SeveralLights
 from shared.appearance.local_roughness import local_roughness
 from shared.appearance.maps import make_maps
-from shared.appearance.observations import Capture, build_capture
 from shared.appearance.problem import AppearanceProblem, AppearanceSettings
 from shared.appearance.projection import SPECULAR_RANGE
 from shared.appearance.texture_pass import TexturePass
 from shared.capture.chart import ChartObservation
 from shared.compute.run_context import SILENT, RunContext
-from shared.geometry.mesh import Mesh, uniform_laplacian
+from shared.geometry.mesh import uniform_laplacian
 from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import TexelSurface
 from shared.imaging.views import Views
+from shared.inverse.lit_surface import LitSurface, report_to
 from shared.inverse.model_selection import SelectedModel, select
+from shared.inverse.pose_rounds import TrackedPoses
 from shared.inverse.problem import (
-    FACE_SKIN,
     InverseResult,
     InverseSettings,
     frames_to_fit,
@@ -35,9 +35,9 @@ from shared.inverse.problem import (
     some_views,
 )
 from shared.inverse.published_clip import solve_by_reference
-from shared.rendering.precomputed_transfer import PrecomputedTransfer, precompute_transfer
-from shared.shape.gauss_newton import Reflectance, typical_edge
-from shared.shape.refine import meet_outline, refine_shape, subdivided_to, surface_error
+from shared.inverse.shaping import shape_and_turn
+from shared.shape.gauss_newton import typical_edge
+from shared.shape.refine import meet_outline, surface_error
 
 HAIRLINE_MM = 10.0
 """Bends of the hairline shorter than this are the mesh's, not the hair's."""
@@ -49,8 +49,10 @@ def solve_clip(
     settings: InverseSettings,
     context: RunContext = SILENT,
     observations: Sequence[ChartObservation] = (),
+    tracked: TrackedPoses | None = None,
 ) -> InverseResult:
-    """The whole of it. views: which of them are fitted is decided here; observations: of a colour chart in view."""
+    """The whole of it. views: which of them are fitted is decided here; observations: of a colour chart in view;
+    tracked: what the poses can be tracked from again, None: they stay as they are."""
     viewer = SurfaceViewer.of(surface.mesh)
     views = views.with_fitted(frames_to_fit(views, surface, settings, viewer))
     if settings.reference is not None:
@@ -72,31 +74,18 @@ def solve_clip(
     if settings.selection is not None:
         selected = select(views, surface, settings, chart, context)
     settings, shape_record = selected.settings, selected.shape_record
-    light_views = some_views(views, settings, settings.light_frames)
 
     # Light on the mesh as it was tracked, or as model selection left it.
+    light_views = some_views(views, settings, settings.light_frames)
     lit = LitSurface.of(selected.surface, light_views, settings, chart, context)
     keeps_start = settings.selection is not None and selected.start is not None
     solution = fit_appearance(lit.coarse, settings.appearance, report_to(context), start=selected.start,
                               keep_start=keeps_start)
 
-    # The mesh refined under that light, and the light anew; kept where held-out frames fit better.
-    if settings.shape is not None and lit.surface.face_segment is not None:
-        refined = refine_shape(
-            some_views(views, settings, settings.shape.frames),
-            lit.surface,
-            reflectance=Reflectance.of(solution, lit.precomputed),
-            appearance=settings.appearance,
-            sizes=settings.sizes,
-            settings=settings.shape,
-            context=context,
-        )
-        lit_then = LitSurface.of(refined.surface, light_views, settings, chart, context, before=lit.surface.mesh)
-        then = fit_appearance(lit_then.coarse, settings.appearance, report_to(context), start=solution)
-        shape_record = judge_shape(solution, then) | {"stopped_vertices": refined.stopped}
-        context.note(f"refined mesh: {shape_record}")
-        if shape_record["refined"]:
-            lit, solution = lit_then, then
+    # Then closer directions where a lamp shines, the mesh refined under that light, and the poses anew on that mesh.
+    shaped = shape_and_turn(views, lit, solution, settings, chart, tracked, context)
+    views, lit, solution = shaped.views, shaped.lit, shaped.solution
+    shape_record = shape_record | shaped.shape_record
     if lit.coarse is not lit.capture:
         solution = fit_all_points(lit.capture, settings.appearance, solution, report_to(context))
     if selected.variation is not None:
@@ -106,7 +95,8 @@ def solve_clip(
     # Under that light, of that shape: every texel's material, and relief finer than the mesh.
     surface, precomputed = lit.surface, lit.precomputed
     viewer = lit.viewer.within_rim(surface_error(surface.tracks))
-    lit = lit_then = None  # texels need the memory that the points' samples and transfer take
+    covariance, pose_record = shaped.covariance, shaped.pose_record
+    lit = shaped = None  # texels need the memory that the points' samples and transfer take
     shading = shade_vertices(views, viewer, precomputed, settings.appearance, solution, context)
     texels = TexelSurface(surface.mesh, settings.map_size)
     typical = np.median(solution.state.albedo, axis=0)
@@ -126,6 +116,7 @@ def solve_clip(
     record = {
         "texture": texture_record,
         "shape": {**shape_record, "outline": outline},
+        "poses": pose_record,
         "relief": relief,
         "diagnostics": diagnostics,
         "warnings": [*filter(None, [chart_warning]), *scale_warnings(chart, typical),
@@ -133,56 +124,8 @@ def solve_clip(
         "albedo_scale": describe_scale(chart, typical),
         "model_selection": selected.candidates,
     }
-    return InverseResult(
-        solution, material, make_maps(texels, material, roughness, turn), shading, viewer, views.fitted, record
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class LitSurface:
-    """A surface ready for its light to be solved: its viewer, precomputed transfer, and what the skin's points show;
-    coarse: what some of them show, on which the light comes to rest."""
-
-    surface: Surface
-    viewer: SurfaceViewer
-    precomputed: PrecomputedTransfer
-    capture: Capture
-    coarse: Capture
-
-    @classmethod
-    def of(
-        cls,
-        surface: Surface,
-        views: Views,
-        settings: InverseSettings,
-        chart: ChartStatement | None,
-        context: RunContext,
-        before: Mesh | None = None,
-    ) -> LitSurface:
-        """Of a surface in some views; before: its mesh before refinement, by which its points are spread."""
-        layout = None if before is None else subdivided_to(before, surface.mesh).vertices
-        viewer = SurfaceViewer.of(surface.mesh, layout)
-        precomputed = precompute_transfer(viewer, settings.sizes, settings.appearance.visibility)
-        moves, skin = settings.appearance.light_moves(views.moves), surface.vertices_of(FACE_SKIN)
-        capture = build_capture(viewer, precomputed, views, moves, skin, settings.sizes.points, context)
-        capture = replace(capture, chart=chart)
-        return cls(surface, viewer, precomputed, capture, capture.some_points(settings.appearance.coarse_points))
-
-
-def report_to(context: RunContext) -> Callable[[dict], None]:
-    """A line for the log of each step's record."""
-    return lambda record: context.note(
-        f"{record['light']} {record['resolution']}, step {record['step']}: residual {record['fitted']:.5f} fitted, "
-        f"{record['held_out']:.5f} held out; specular {record['specular_intensity']:.3f}, "
-        f"roughness {record['roughness']:.3f}"
-    )
-
-
-def judge_shape(before: Solution, after: Solution) -> dict:
-    """Is the refined mesh kept, and why: held-out residuals, fitted ones where no frame could be held out."""
-    name = "held_out" if before.held_out > 0 else "fitted"
-    residuals = {"before": getattr(before, name), "after": getattr(after, name)}
-    return {"refined": residuals["after"] < residuals["before"], name: residuals}
+    maps = make_maps(texels, material, roughness, turn)
+    return InverseResult(solution, material, maps, shading, viewer, views, record, covariance)
 
 
 def examine(
@@ -248,7 +191,7 @@ def summarise(result: InverseResult, moves: str) -> dict:
             "held_out": solution.held_out,
             "texture_held_out": result.record["texture"]["held_out"],
         },
-        **{key: result.record[key] for key in ("shape", "relief", "diagnostics") if key in result.record},
+        **{key: result.record[key] for key in ("shape", "poses", "relief", "diagnostics") if key in result.record},
         **({"model_selection": [dict(candidate) for candidate in tried]} if tried else {}),
         "iterations": list(solution.iterations),
         "albedo_scale": result.record["albedo_scale"],

@@ -67,25 +67,28 @@ class ShapeSettings:
 @dataclass(frozen=True)
 class Reflectance:
     """What the shape is solved under: light [6 n^2, 3], specular intensity, roughness and how it varies; nodes with
-    their albedo [K, 3]: where light bounced when it was solved; light_weights: of several lights, which lie one below
-    the other, how much samples of each count."""
+    their albedo [K, 3]: where light bounced when it was solved; directions [J, 3] that suit the light; light_weights:
+    of several lights, which lie one below the other, how much samples of each count."""
 
     light: np.ndarray
     specular: float
     roughness: float
     nodes: Nodes
     node_albedo: np.ndarray
+    directions: np.ndarray
     local_roughness_fit: SpecularEquations | None = None
     light_weights: tuple[float, ...] = ()
 
     @staticmethod
-    def of(solution: Solution, precomputed: PrecomputedTransfer) -> Reflectance:
-        """That of a solved appearance."""
+    def of(
+        solution: Solution, precomputed: PrecomputedTransfer, directions: np.ndarray | None = None
+    ) -> Reflectance:
+        """That of a solved appearance; directions [J, 3]: others than its transfer has."""
         state = solution.state
         return Reflectance(
             light=state.light, specular=state.specular, roughness=state.roughness, nodes=precomputed.nodes,
-            node_albedo=state.node_albedo, local_roughness_fit=solution.local_roughness_fit,
-            light_weights=solution.light_weights,
+            node_albedo=state.node_albedo, directions=precomputed.directions if directions is None else directions,
+            local_roughness_fit=solution.local_roughness_fit, light_weights=solution.light_weights,
         )
 
 
@@ -161,7 +164,9 @@ class ShapeSolver:
         index = np.nonzero(wanted & face_front(viewer, views.camera_from_head, 0.2))[0]
         points = mesh_points(mesh, index)
         if before is None:
-            precomputed = precompute_transfer(viewer, self.sizes, self.appearance.visibility)
+            precomputed = precompute_transfer(
+                viewer, self.sizes, self.appearance.visibility, self.reflectance.directions
+            )
             transfer = precomputed.trace(points)
         else:
             precomputed, transfer = before.precomputed, before.transfer.take(nearest_points(points, before.points))

@@ -52,17 +52,18 @@ def coarse_pass(face_width_px: float) -> TrackingPass:
 
 
 class AtlasTracker:
-    """The frames of a clip over one fitted head."""
+    """The frames of a clip over one surface."""
 
     def __init__(
-        self, clip: TrackedClip, model: HeadModel, vertices: np.ndarray, depth_mm: float, settings: TrackingPass
+        self, clip: TrackedClip, mesh: Mesh, usable_face: np.ndarray, depth_mm: float, settings: TrackingPass
     ):
-        """vertices [V, 3] mm of the fitted head; depth_mm: its distance from the camera."""
-        self._clip, self._vertices, self._settings = clip, vertices, settings
-        mesh = Mesh(vertices, model.faces, model.uvs, model.face_uvs)
+        """mesh: of V vertices; usable_face [faces] bool: which are tracked; depth_mm: the head's distance from the
+        camera."""
+        self._clip, self._vertices, self._settings = clip, mesh.vertices, settings
         texel_mm = settings.texel_px * depth_mm / clip.intrinsics[0, 0]
-        self.atlas: Atlas = build_atlas(mesh, trackable_faces(model), texel_mm, settings.count)
-        self._scene, self._normals = RayScene(vertices, model.faces), vertex_normals(vertices, model.faces)
+        self.atlas: Atlas = build_atlas(mesh, usable_face, texel_mm, settings.count)
+        self._scene = RayScene(mesh.vertices, mesh.faces)
+        self._normals = vertex_normals(mesh.vertices, mesh.faces)
         self._pictures = clip.detail if settings.detail else clip.contrast
         self._shrink = max(1, round(settings.texel_px))
         self._visible: dict[bytes, np.ndarray] = {}
@@ -138,7 +139,8 @@ def track_texture(
 
     poses [F, 4, 4] of the fitted head. -> tracks, their points [N, 3] on the head and the poses found.
     """
-    tracker = AtlasTracker(clip, model, vertices, float(np.median(poses[known, 2, 3])), settings)
+    mesh = Mesh(vertices, model.faces, model.uvs, model.face_uvs)
+    tracker = AtlasTracker(clip, mesh, trackable_faces(model), float(np.median(poses[known, 2, 3])), settings)
     texture = tracker.mean(np.nonzero(known)[0], poses, progress)
     tracks = tracker.track(texture, np.nonzero(tracked)[0], poses, progress)
     points = tracker.atlas.points(vertices)

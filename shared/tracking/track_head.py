@@ -123,7 +123,7 @@ def track_head(
         before = fit.camera_from_head(found.solution.camera_from_points)
         finer, aside = _fine_pass(clip, model, fit, before, found.reliable, fine, progress)
         note(_summary("fine tracks", finer))
-        held_out = tuple(_held_out_px(clip, aside, poses) for poses in (before, finer.solution.camera_from_points))
+        held_out = tuple(held_out_px(clip, aside, poses) for poses in (before, finer.solution.camera_from_points))
         if held_out[1] > held_out[0]:
             note(f"dropped: tracks kept aside went from {held_out[0]:.3f} to {held_out[1]:.3f} px")
             break
@@ -227,8 +227,8 @@ def _fine_pass(clip, model, fit, poses, reliable, settings, progress) -> tuple[A
     return found, (tracks.subset(points=aside), points[aside])
 
 
-def _held_out_px(clip: TrackedClip, aside: tuple[Tracks, np.ndarray], poses: np.ndarray) -> float:
-    """Median error of tracks that no adjustment has seen, their points placed by the poses [F, 4, 4]."""
+def held_out_px(clip: TrackedClip, aside: tuple[Tracks, np.ndarray], poses: np.ndarray) -> float:
+    """Median error, px, of tracks that no adjustment has seen, their points placed by the poses [F, 4, 4]."""
     tracks, points = aside
     solved = place_points(tracks, poses, points, clip.intrinsics, loss_scale=LOSS, prior_mm=100.0)
     return float(np.nanmedian(solved.error_px))

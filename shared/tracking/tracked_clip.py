@@ -116,7 +116,11 @@ class GreyFrame:
     def contrast(self, face_width_px: float) -> tuple[np.ndarray, np.ndarray]:
         """The wide contrast of the skin and its finest detail, [H, W] uint8 each."""
         sigma = float(np.clip(face_width_px / 55.0, 2.5, 12.0))
-        return self._contrast(sigma, 1.5 * sigma, 0.02), self._contrast(DETAIL_SIGMA_PX, 2.25 * DETAIL_SIGMA_PX, 0.05)
+        return self._contrast(sigma, 1.5 * sigma, 0.02), self.detail()
+
+    def detail(self) -> np.ndarray:
+        """The skin's finest detail alone, [H, W] uint8."""
+        return self._contrast(DETAIL_SIGMA_PX, 2.25 * DETAIL_SIGMA_PX, 0.05)
 
     def _contrast(self, sigma_px: float, spread_px: float, floor: float) -> np.ndarray:
         """Local contrast, of green and blue where red is clipped."""

@@ -71,7 +71,7 @@ def test_it_finds_the_albedo(clip):
     assert after < 0.6 * before and after < 0.11
     assert result.solution.fitted < 0.6 * first.solution.fitted
     record = summarise(result, "head")
-    assert np.nonzero(~result.fitted)[0].tolist() == [2, 6]
+    assert np.nonzero(~result.views.fitted)[0].tolist() == [2, 6]
     assert np.isfinite([record["residuals"]["fitted"], record["residuals"]["held_out"]]).all()
     assert any("iteration 160" in line for line in states["notes"])
     assert result.shading.irradiance(0).shape == (len(clip.mesh.vertices), 3)

@@ -19,7 +19,7 @@ from shared.geometry.surface import TrackPoints
 from shared.geometry.transforms import projection_slope
 from shared.imaging.image_sampling import prepare_picture
 from shared.imaging.views import Views
-from shared.inverse.solve import judge_shape
+from shared.inverse.shaping import judge_shape
 from shared.rendering.envmap import cube_directions
 from shared.rendering.normal_derivatives import Reflections, shading_terms
 from shared.shape.equations import EquationSettings, variance_inflation
@@ -61,7 +61,7 @@ def toy():
     known = np.nonzero((depth < 0.01) & (start.vertices[:, 2] > 20.0))[0][::3]
     tracks = TrackPoints(start.vertices[known], np.full(len(known), 0.15))
     views = Views.in_one_light(poses, LENS, (SIZE, SIZE), "head", pictures.__getitem__, None, fitted)
-    known = Reflectance(light, SPECULAR, ROUGHNESS, precomputed.nodes, material.node_albedo)
+    known = Reflectance(light, SPECULAR, ROUGHNESS, precomputed.nodes, material.node_albedo, precomputed.directions)
     return Toy(start, truth, views, tracks, known)
 
 

@@ -77,7 +77,7 @@ def measure(inputs: ClipInputs, candidate: str, refine: bool, given: dict) -> di
     context = RunContext(progress, print if candidate == "auto" else lambda text: None)
     result = solve_clip(inputs.views, inputs.surface, settings, context)
     solution = result.solution
-    judged = ~some_views(inputs.views.with_fitted(result.fitted), settings, settings.light_frames).fitted
+    judged = ~some_views(result.views, settings, settings.light_frames).fitted
     accepted = [row for row in result.record["model_selection"] if row["accepted"]]
     return {
         "mesh": "refined" if refine else "tracked",
