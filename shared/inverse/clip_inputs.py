@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,13 +16,20 @@ from shared.geometry.surface import Surface, TrackPoints
 from shared.imaging.color import decode_transfer, eight_bit
 from shared.imaging.image_sampling import Picture, prepare_picture
 from shared.imaging.views import Views
-from shared.inverse.pose_rounds import TrackedPoses
 from shared.inverse.texture_match import ClipTexture
 from shared.io.arrays import load_arrays, read_json
 from shared.io.frames import FrameSet
 from shared.io.images import read_exr
 from shared.io.meshes import load_mesh, read_obj
 from shared.tracking.tracked_clip import GreyFrame, TrackedClip
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPoses:
+    """How to look at a clip's frames again, and the covariance [F, 6, 6] of the poses that it was tracked to."""
+
+    look: Callable[[], TrackedClip]
+    covariance: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,13 +10,13 @@ one do.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from shared.compute.run_context import RunContext
 from shared.geometry.surface import Surface
+from shared.inverse.clip_inputs import TrackedPoses
 from shared.tracking.bundle import Tracks, resect
 from shared.tracking.first_poses import LOSS, UNTRACKED_SEGMENTS, Adjusted
 from shared.tracking.pose_uncertainty import estimate_uncertainty, rotations_apart
@@ -31,14 +31,6 @@ in soft light, where nothing is gained, and 0.7 under a hard lamp. A round that 
 last."""
 
 FINE = TrackingPass(texel_px=1.0, detail=True, count=2500, windows=Windows(sigma=5.0), prior_mm=10.0)
-
-
-@dataclass(frozen=True, eq=False)
-class TrackedPoses:
-    """How to look at a clip's frames again, and the covariance [F, 6, 6] of the poses that it was tracked to."""
-
-    look: Callable[[], TrackedClip]
-    covariance: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

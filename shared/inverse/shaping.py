@@ -16,8 +16,9 @@ from shared.appearance.fit import Solution, fit_appearance
 from shared.compute.run_context import RunContext
 from shared.geometry.surface import Surface
 from shared.imaging.views import Views
+from shared.inverse.clip_inputs import TrackedPoses
 from shared.inverse.lit_surface import LitSurface, report_to, suited_directions
-from shared.inverse.pose_rounds import TrackedPoses, repeat_poses
+from shared.inverse.pose_rounds import repeat_poses
 from shared.inverse.problem import InverseSettings, some_views
 from shared.shape.gauss_newton import Reflectance
 from shared.shape.refine import refine_shape

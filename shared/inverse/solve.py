@@ -24,9 +24,9 @@ from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import TexelSurface
 from shared.imaging.views import Views
+from shared.inverse.clip_inputs import TrackedPoses
 from shared.inverse.lit_surface import LitSurface, report_to
 from shared.inverse.model_selection import SelectedModel, select
-from shared.inverse.pose_rounds import TrackedPoses
 from shared.inverse.problem import (
     InverseResult,
     InverseSettings,

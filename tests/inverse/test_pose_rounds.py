@@ -9,7 +9,8 @@ from shared.compute.run_context import SILENT
 from shared.geometry.raycast import RayScene, camera_hits
 from shared.geometry.surface import Surface
 from shared.geometry.transforms import rotation_from_vector
-from shared.inverse.pose_rounds import TrackedPoses, repeat_poses
+from shared.inverse.clip_inputs import TrackedPoses
+from shared.inverse.pose_rounds import repeat_poses
 from shared.tracking.pose_uncertainty import rotations_apart
 from shared.tracking.tracked_clip import GreyFrame, TrackedClip
 

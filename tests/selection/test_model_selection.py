@@ -228,7 +228,7 @@ class Seen:
     def __init__(self, views, surface, settings, chart, context, refined=None):
         self.surface, self.refined, self.sizes = surface, refined, None
         self.captures = {visible: surface.capture for visible in (False, True)}
-        self.precomputed = dict.fromkeys(self.captures, SimpleNamespace(nodes=None))
+        self.precomputed = dict.fromkeys(self.captures, SimpleNamespace(nodes=None, directions=None))
 
 
 def noisy(capture, sigma):
