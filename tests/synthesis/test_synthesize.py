@@ -15,7 +15,14 @@ from shared.capture.chart import CORNERS, reflectances
 from shared.capture.chart_finder import read_chart
 from shared.errors import InputError
 from shared.geometry.mesh import Mesh
-from shared.geometry.transforms import WORLD_FROM_CAMERA, project, rigid, vector_from_rotation, world_from_head
+from shared.geometry.transforms import (
+    WORLD_FROM_CAMERA,
+    project,
+    rigid,
+    rotation_from_vector,
+    vector_from_rotation,
+    world_from_head,
+)
 from shared.imaging.texture import sample_bilinear
 from shared.io.images import read_exr, read_png
 from shared.io.meshes import read_obj
@@ -26,8 +33,14 @@ from tools.synthesis.camera import PictureQuality, PinholeCamera, take_picture
 from tools.synthesis.chart import PlacedChart, add_chart, chart_irradiance
 from tools.synthesis.head import DRIFT_DEG, YAW_DEG, head_turn
 from tools.synthesis.highlights import LobeSamples, sample_lobe, specular_radiance
-from tools.synthesis.irradiance import IrradianceQuality, SyntheticShot, assemble_atlas, group_irradiance
-from tools.synthesis.light import ENVIRONMENTS, EnvironmentLight, procedural_environment
+from tools.synthesis.irradiance import (
+    IrradianceQuality,
+    SyntheticShot,
+    assemble_atlas,
+    covered_texels,
+    group_irradiance,
+)
+from tools.synthesis.light import ENVIRONMENTS, EnvironmentLight, LampSphere, procedural_environment
 from tools.synthesis.output import ClipWriter, rounded, sensor_codes, write_scene_truth
 from tools.synthesis.render import RenderQuality, Scene, render
 from tools.synthesis.sampling import shifted_hammersley
@@ -163,6 +176,59 @@ def test_the_fast_renderer_agrees_with_brute_force():
     assert np.abs(fast.mean(0) / slow.mean(0) - 1).max() < 0.01
     tolerance = 4 * error + 0.03 * slow.mean()
     assert (np.abs(fast - slow) < tolerance).mean() > 0.98
+
+
+def test_a_near_lamp_gives_what_the_inverse_square_says():
+    """Intensity over squared distance times the cosine, wherever the head stands and however it is turned; at the
+    lamps' centre what a far lamp gives."""
+    image = procedural_environment("lamp", 0)
+    far, centre = EnvironmentLight(image), np.array([30.0, -20.0, -900.0])
+    near = EnvironmentLight(image, LampSphere(centre, 400.0))
+    surface = SyntheticSurface(round_mesh(80.0, np.pi, inward=False), plain())
+    turn = rotation_from_vector(np.array([0.1, 0.5, -0.2]))
+    shot = SyntheticShot(rigid(WORLD_FROM_CAMERA @ turn, np.array([10.0, 5.0, 1000.0])), turn, 0, 1)
+    quality = replace(COARSE, lamp_samples=64)
+    direct, under_far = (group_irradiance(surface, [light], [shot], 0, quality, 0).direct[:, 0]
+                         for light in (near, far))
+    _, face, bary = covered_texels(surface, COARSE.size)
+    points = surface.points(face, bary)
+    chosen = np.random.default_rng(0).integers(COARSE.groups, size=len(face)) == 0
+    world = points.position[chosen] @ turn.T + WORLD_FROM_CAMERA @ shot.camera_from_head[:3, 3]
+    normal = points.normal[chosen] @ turn.T
+    lamp = centre + 400.0 * near.main_lamp()
+    towards = lamp - world
+    distance = np.linalg.norm(towards, axis=1)
+    cosine = (towards * normal).sum(1) / distance
+    expected = far.lamp_irradiance(near.main_lamp()) * (cosine * 400.0**2 / distance**2)[:, None]
+    found = direct - under_far + far.lamp_irradiance(normal)  # without the smooth rest, which is the same in both
+    lit = (cosine > 0.3) & (normal @ near.main_lamp() > 0.1)
+    assert lit.sum() > 30 and np.ptp(distance[lit]) > 40.0
+    np.testing.assert_allclose(found[lit], expected[lit], rtol=0.02)
+    assert np.abs(found[cosine < -0.2]).max() < 0.01 * expected.max()
+
+
+def test_highlights_of_a_near_lamp_are_those_of_a_far_one_where_it_is_seen():
+    """At one point, a near lamp is a far one in another direction and of another strength."""
+    image, centre = procedural_environment("lamp", 0), np.zeros(3)
+    light = EnvironmentLight(image, LampSphere(centre, 500.0))
+    surface = SyntheticSurface(round_mesh(80.0, np.pi, inward=False), plain())
+    samples = LobeSamples.draw(light, np.eye(3), 16, 64, np.random.default_rng(0), light.lamps_at)
+    points = surface.points(np.arange(0, len(surface.mesh.faces), 97), np.full((95, 3), 1 / 3))
+    outgoing = points.normal
+    choice, black = np.arange(len(points.position)) % 64, np.zeros((8, 8, 3), np.float32)
+    roughness = np.full(len(choice), 0.4, np.float32)
+    found = specular_radiance(surface, light, black, np.eye(3), points, outgoing, roughness, samples, choice)
+    for p in range(0, len(choice), 7):
+        towards = 500.0 * samples.lamp_directions[choice[p]] - points.position[p]
+        distance = np.linalg.norm(towards, axis=1, keepdims=True)
+        moved = replace(samples, lamps_at=None, lamp_directions=samples.lamp_directions.copy(),
+                        lamp_weights=samples.lamp_weights.copy())
+        moved.lamp_directions[choice[p]] = towards / distance
+        moved.lamp_weights[choice[p]] *= (500.0 / distance) ** 2
+        one = points.select(slice(p, p + 1))
+        expected = specular_radiance(surface, light, black, np.eye(3), one, outgoing[p:p + 1], roughness[:1], moved,
+                                     choice[p:p + 1])
+        np.testing.assert_allclose(found[p], expected[0], rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
@@ -312,4 +378,6 @@ def test_bad_arguments_are_one_line_and_exit_code_two(tmp_path, capsys):
     (tmp_path / "subject.yaml").write_text("video: x\n")
     assert main([str(tmp_path)]) == 2
     assert "holds a subject already" in capsys.readouterr().err
+    assert main([str(tmp_path / "new"), "--lamp-distance", "50"]) == 2
+    assert "inside the head's reach" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()

@@ -57,7 +57,8 @@ def take_picture(surface: SyntheticSurface, light: EnvironmentLight, irradiance:
     rays = quality.sub**2
     rng = np.random.default_rng(shot.seed)
     samples = LobeSamples.draw(light, shot.world_from_head, rays * quality.lobe_samples,
-                                rays * quality.lamp_samples, rng)
+                                rays * quality.lamp_samples, rng,
+                                None if light.lamps_at is None else shot.in_head_space(light.lamps_at))
     pixels = _head_pixels(surface, shot, camera)
     choice = rng.integers(SAMPLE_SETS, size=len(pixels))
     background = _background(light, shot, camera)
@@ -100,7 +101,7 @@ def _camera_directions(points_px: np.ndarray, camera: PinholeCamera) -> np.ndarr
 
 
 def _background(light: EnvironmentLight, shot: SyntheticShot, camera: PinholeCamera) -> np.ndarray:
-    """[H, W, 3] what the camera sees past the head: the light itself."""
+    """[H, W, 3] what the camera sees past the head: the light itself, near lamps as if they were far."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1) + 0.5
     world_from_camera = shot.world_from_head @ shot.camera_from_head[:3, :3].T
     return latlong_lookup(light.image, normalised(_camera_directions(pixels, camera)) @ world_from_camera.T)

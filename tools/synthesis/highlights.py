@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shared.rendering import brdf
-from tools.synthesis.light import EnvironmentLight
+from tools.synthesis.light import EnvironmentLight, LampSphere
 from tools.synthesis.sampling import shifted_hammersley, tangent_frame, visible_ggx_normal
 from tools.synthesis.surface import ShadingPoints, SyntheticSurface, nearest_texel
 
@@ -21,27 +21,37 @@ SAMPLE_SETS = 64
 @dataclass(frozen=True)
 class LobeSamples:
     """Random sets that points pick from: lobe [sets, K, 2] in the unit square; lamp directions in head space and
-    weights [sets, K, 3]."""
+    weights [sets, K, 3]; lamps_at: where near lamps stand in head space, None: they are far."""
 
     lobe: np.ndarray
     lamp_directions: np.ndarray
     lamp_weights: np.ndarray
+    lamps_at: LampSphere | None = None
 
     @staticmethod
     def draw(light: EnvironmentLight, world_from_head: np.ndarray, lobe_count: int, lamp_count: int,
-             rng: np.random.Generator) -> LobeSamples:
+             rng: np.random.Generator, lamps_at: LampSphere | None = None) -> LobeSamples:
         """Well spread samples for one shot."""
         lobe = shifted_hammersley(lobe_count, SAMPLE_SETS, rng).astype(np.float32)
         lamps = shifted_hammersley(lamp_count, SAMPLE_SETS, rng)
         world, weights = light.sample_lamps(lamps.reshape(-1, 2))
         shape = (SAMPLE_SETS, lamp_count, 3)
         directions = (world @ world_from_head).reshape(shape).astype(np.float32)
-        return LobeSamples(lobe, directions, weights.reshape(shape).astype(np.float32))
+        return LobeSamples(lobe, directions, weights.reshape(shape).astype(np.float32), lamps_at)
+
+    def of_lamps(self, points: np.ndarray, choice: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Directions and weights [N, K, 3] at points [N, 3], of the set of each, choice [N]."""
+        directions, weights = self.lamp_directions[choice], self.lamp_weights[choice]
+        if self.lamps_at is None:
+            return directions, weights
+        directions, gain = self.lamps_at.seen_from(points, directions)
+        return directions, weights * gain[..., None]
 
     def part(self, index: int, count: int) -> LobeSamples:
         """Every count-th sample from `index` on: one stratum of each set."""
         every = slice(index, None, count)
-        return LobeSamples(self.lobe[:, every], self.lamp_directions[:, every], self.lamp_weights[:, every])
+        return LobeSamples(self.lobe[:, every], self.lamp_directions[:, every], self.lamp_weights[:, every],
+                           self.lamps_at)
 
 
 def specular_radiance(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray,
@@ -54,8 +64,7 @@ def specular_radiance(surface: SyntheticSurface, light: EnvironmentLight, irradi
     """
     smooth = _smooth_part(surface, light, irradiance, world_from_head, points, outgoing, roughness,
                           samples.lobe[choice])
-    lamps = _lamp_part(surface, points, outgoing, roughness, samples.lamp_directions[choice],
-                       samples.lamp_weights[choice])
+    lamps = _lamp_part(surface, points, outgoing, roughness, *samples.of_lamps(points.position, choice))
     return smooth + lamps
 
 

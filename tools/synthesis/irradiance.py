@@ -2,7 +2,8 @@
 
 The head is rigid, so the visibility of a surface point is the same in each shot; only the light turns. Each texel
 traces one set of directions, and the irradiance of all shots is a matrix product of its cosines with their light.
-Lamps, which such a set would miss, get shadow rays of their own in each shot. Light that arrives over one bounce is
+Lamps, which such a set would miss, get shadow rays of their own in each shot, towards where each texel sees them if
+they stand near. Light that arrives over one bounce is
 the irradiance of the texels that the blocked rays hit, times their albedo / pi; the second surface reflects
 diffusely only.
 
@@ -19,8 +20,8 @@ import scipy.sparse as sparse
 from scipy.ndimage import distance_transform_edt
 
 from shared.geometry.mesh import rasterize_uv
-from shared.geometry.transforms import fibonacci_sphere
-from tools.synthesis.light import EnvironmentLight
+from shared.geometry.transforms import WORLD_FROM_CAMERA, fibonacci_sphere
+from tools.synthesis.light import EnvironmentLight, LampSphere
 from tools.synthesis.sampling import random_rotation, shifted_hammersley
 from tools.synthesis.surface import ShadingPoints, SyntheticSurface, nearest_texel
 
@@ -35,6 +36,15 @@ class SyntheticShot:
     world_from_head: np.ndarray
     light: int
     seed: int
+
+    @property
+    def place(self) -> np.ndarray:
+        """[3] mm: the head's origin in world space, whose own origin is the camera."""
+        return WORLD_FROM_CAMERA @ self.camera_from_head[:3, 3]
+
+    def in_head_space(self, lamps: LampSphere) -> LampSphere:
+        """Lamps of world space."""
+        return LampSphere((lamps.centre - self.place) @ self.world_from_head, lamps.distance_mm)
 
 
 @dataclass(frozen=True)
@@ -80,8 +90,7 @@ def group_irradiance(surface: SyntheticSurface, lights: list[EnvironmentLight], 
         batch = points.select(slice(start, start + BATCH))
         visible, bounce = _trace_directions(surface, batch, directions, quality.size)
         smooth = (visible @ incident).reshape(len(visible), len(shots), 3)
-        share = _visible_lamp_share(surface, batch, *lamps)
-        direct.append(smooth + share * _unblocked_lamps(lights, shots, batch.normal))
+        direct.append(smooth + _lamp_irradiance(surface, lights, shots, batch, *lamps))
         rows.append(bounce)
     return GroupResult(texels[chosen], np.concatenate(direct), sparse.vstack(rows, format="csr"))
 
@@ -106,6 +115,34 @@ def _lamp_samples(lights: list[EnvironmentLight], shots: list[SyntheticShot], co
     samples = [lights[shot.light].sample_lamps(points[i]) for i, shot in enumerate(shots)]
     directions = np.stack([world @ shot.world_from_head for (world, _), shot in zip(samples, shots, strict=True)])
     return directions.astype(np.float32), np.stack([weight / count for _, weight in samples]).astype(np.float32)
+
+
+def _lamp_irradiance(surface: SyntheticSurface, lights: list[EnvironmentLight], shots: list[SyntheticShot],
+                     points: ShadingPoints, directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """[T, S, 3] irradiance of the shots' lamps, from their samples [S, K, 3]."""
+    near = np.array([lights[shot.light].lamps_at is not None for shot in shots])
+    far = [shot for shot, is_near in zip(shots, near, strict=True) if not is_near]
+    total = np.zeros((len(points.position), len(shots), 3), np.float32)
+    if far:
+        share = _visible_lamp_share(surface, points, directions[~near], weights[~near])
+        total[:, ~near] = share * _unblocked_lamps(lights, far, points.normal)
+    for s in np.nonzero(near)[0]:
+        lamps = shots[s].in_head_space(lights[shots[s].light].lamps_at)
+        total[:, s] = _near_lamp_irradiance(surface, points, lamps, directions[s], weights[s])
+    return total
+
+
+def _near_lamp_irradiance(surface: SyntheticSurface, points: ShadingPoints, lamps: LampSphere, directions: np.ndarray,
+                          weights: np.ndarray) -> np.ndarray:
+    """[T, 3] irradiance of near lamps in one shot, from samples [K, 3] of them as their centre sees them."""
+    towards, gain = lamps.seen_from(points.position, directions)
+    cosine = np.einsum("tkc,tc->tk", towards, points.normal)
+    above = np.einsum("tkc,tc->tk", towards, points.geometric_normal) > 0
+    row, column = np.nonzero((cosine > 0) & above)
+    free = ~surface.scene.occluded(points.origins[row], towards[row, column])
+    lit = np.zeros_like(cosine)
+    lit[row[free], column[free]] = (cosine * gain)[row[free], column[free]]
+    return lit @ weights
 
 
 def _unblocked_lamps(lights: list[EnvironmentLight], shots: list[SyntheticShot], normals: np.ndarray) -> np.ndarray:

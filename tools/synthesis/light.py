@@ -2,12 +2,14 @@
 
 An environment is split in two: what exceeds `LAMP_THRESHOLD` times the mean (lamps, windows, the sun) is sampled by
 importance, the smooth rest by uniform or lobe-shaped directions. The two parts add up to the map exactly, so nothing is
-lost and neither part is noisy.
+lost and neither part is noisy. Lamps may stand at a distance (LampSphere); the smooth rest is always far away.
 
 References: Pharr, Jakob and Humphreys, Physically Based Rendering, 4th ed., 12.5 (sampling of infinite area lights).
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -19,10 +21,29 @@ TABLE_HEIGHT = 256
 IRRADIANCE_ROWS, IRRADIANCE_COLUMNS = 49, 96
 
 
-class EnvironmentLight:
-    """Incident radiance from far away: image [H, 2 H, 3], linear, read bilinearly; directions are in world space."""
+@dataclass(frozen=True)
+class LampSphere:
+    """Where near lamps stand: each in its direction, distance_mm from one centre [3] mm. A lamp is small and shines
+    alike to all sides; the map says what of it arrives at the centre."""
 
-    def __init__(self, image: np.ndarray):
+    centre: np.ndarray
+    distance_mm: float
+
+    def seen_from(self, points: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lamps in the directions [K, 3], or [N, K, 3], as points [N, 3] mm see them: unit directions [N, K, 3], and
+        what arrives there of one relative to what arrives at the centre, (distance from the centre / from the point)^2
+        [N, K]. All in the centre's space."""
+        towards = directions + ((self.centre - points) / self.distance_mm)[:, None]
+        square = np.square(towards).sum(-1)
+        return (towards / np.sqrt(square)[..., None]).astype(np.float32), (1.0 / square).astype(np.float32)
+
+
+class EnvironmentLight:
+    """Incident radiance: image [H, 2 H, 3], linear, read bilinearly; directions are in world space. lamps_at: where its
+    lamps stand in world space, None: far away; the image is what arrives at the centre of these then."""
+
+    def __init__(self, image: np.ndarray, lamps_at: LampSphere | None = None):
+        self.lamps_at = lamps_at
         self.image = np.asarray(image, np.float32)
         self._table = latlong_lookup(self.image, latlong_directions(TABLE_HEIGHT)).astype(np.float32)
         edges = np.cos(np.pi * np.arange(TABLE_HEIGHT + 1) / TABLE_HEIGHT)
@@ -45,6 +66,15 @@ class EnvironmentLight:
     def lamp_irradiance(self, normals: np.ndarray) -> np.ndarray:
         """[..., 3] unit normals in world space -> [..., 3] irradiance of the lamps when nothing blocks them."""
         return self._look_up(self._lamp_irradiance, normals)
+
+    def main_lamp(self) -> np.ndarray:
+        """[3] unit world direction of the strongest lamp: the mean of what shines within 30 degrees of the brightest.
+        """
+        directions = latlong_directions(TABLE_HEIGHT)
+        power = self._lamps.mean(-1) * self._solid_angle[:, None]
+        brightest = directions.reshape(-1, 3)[self._lamps.mean(-1).argmax()]
+        mean = (power * (directions @ brightest > np.cos(np.radians(30.0)))).ravel() @ directions.reshape(-1, 3)
+        return mean / np.linalg.norm(mean)
 
     def _integrate_lamps(self) -> np.ndarray:
         """Lat-long table of lamp_irradiance: every lamp pixel on every normal of a coarse grid, then interpolated.

@@ -82,6 +82,18 @@ def write_scene_truth(folder: Path, scene: Scene, mesh: Mesh, mantissa_bits: int
         texture = rounded(getattr(scene.materials, name), mantissa_bits)
         write_exr(folder / f"{name}.exr", texture, colour_space=space, half=True)
     write_environment(folder / "envmap.exr", scene.lights[0])
+    if scene.lamps_at is not None:
+        write_lamp(folder / "lamp.json", scene)
+
+
+def write_lamp(path: Path, scene: Scene) -> None:
+    """lamp.json: where the main lamp of the clip's near lamps stands, mm, world space (origin: the camera)."""
+    sphere, direction = scene.lamps_at, scene.environments()[0].main_lamp()
+    write_json(path, {
+        "distance_mm": sphere.distance_mm,
+        "reference_mm": sphere.centre.tolist(),
+        "direction": direction.tolist(),
+        "position_mm": (sphere.centre + sphere.distance_mm * direction).tolist()})
 
 
 def write_environment(path: Path, image: np.ndarray) -> None:

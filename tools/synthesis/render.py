@@ -20,7 +20,7 @@ from shared.geometry.mesh import Mesh
 from tools.synthesis.camera import PictureQuality, PinholeCamera, take_picture
 from tools.synthesis.chart import PlacedChart, add_chart
 from tools.synthesis.irradiance import GroupResult, IrradianceQuality, SyntheticShot, assemble_atlas, group_irradiance
-from tools.synthesis.light import EnvironmentLight
+from tools.synthesis.light import EnvironmentLight, LampSphere
 from tools.synthesis.surface import Materials, SyntheticSurface
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -28,12 +28,18 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 @dataclass(frozen=True)
 class Scene:
-    """A textured mesh, the environments [H, 2 H, 3] that its shots choose from, and a colour chart in all of them."""
+    """A textured mesh, the environments [H, 2 H, 3] that its shots choose from, and a colour chart in all of them;
+    lamps_at: where the lamps of the first environment stand in world space, None: far away."""
 
     mesh: Mesh
     materials: Materials
     lights: tuple[np.ndarray, ...]
     chart: PlacedChart | None = None
+    lamps_at: LampSphere | None = None
+
+    def environments(self) -> list[EnvironmentLight]:
+        """Of each of the lights."""
+        return [EnvironmentLight(image, None if k else self.lamps_at) for k, image in enumerate(self.lights)]
 
 
 @dataclass(frozen=True)
@@ -50,7 +56,7 @@ class _Worker:
 
     def __init__(self, scene: Scene, shots: list[SyntheticShot], camera: PinholeCamera, quality: RenderQuality):
         self.surface = SyntheticSurface(scene.mesh, scene.materials)
-        self.lights = [EnvironmentLight(image) for image in scene.lights]
+        self.lights = scene.environments()
         self.chart = scene.chart
         self.shots, self.camera, self.quality = shots, camera, quality
 

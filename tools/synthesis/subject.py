@@ -2,10 +2,12 @@
 
     python -m tools.synthesize DEST [--preset demo|tiny] [--size 400] [--frames 48] [--light lamp] [--chart] ...
     python -m tools.synthesize DEST --scan SUBJECT --light lamp --clipped 0.25
+    python -m tools.synthesize DEST --light lamp --lamp-distance 600
 
 Writes:  DEST/subject.yaml, capture.json, the clip (video.avi, or frames/%04d.png), synthesis.json (how it was made);
-         gt/: mesh.obj, albedo.exr, specular.exr, roughness.exr, mask.exr (UV), envmap.exr, poses.npz, and for some
-         frames frames/NNNN_*.exr and .png; relight/: the same head under other lights. tools/score.py reads all of it.
+         gt/: mesh.obj, albedo.exr, specular.exr, roughness.exr, mask.exr (UV), envmap.exr, poses.npz, where lamps
+         stand near lamp.json, and for some frames frames/NNNN_*.exr and .png; relight/: the same head under other
+         lights. tools/score.py reads all of it.
 Method:  a random head of the head model with procedural skin, bumps and bust, or the scan of another subject; a
          procedural light; direct light with one diffuse bounce and the GGX lobe, traced with embree (irradiance,
          camera); sensor noise, 8-bit sRGB.
@@ -38,7 +40,7 @@ from tools.synthesis.camera import PictureQuality, PinholeCamera
 from tools.synthesis.chart import place_chart
 from tools.synthesis.head import PITCH_DEG, YAW_DEG, face_part, head_turn, random_head
 from tools.synthesis.irradiance import IrradianceQuality, SyntheticShot
-from tools.synthesis.light import ENVIRONMENTS, procedural_environment
+from tools.synthesis.light import ENVIRONMENTS, LampSphere, procedural_environment
 from tools.synthesis.render import RenderQuality, Scene, render
 from tools.synthesis.scan import read_scan
 from tools.synthesis.skin import Complexion, SkinPainter
@@ -58,6 +60,8 @@ EXPOSURE_SIZE, EXPOSURE_VIEWS = 200, 3
 LEAST_IRRADIANCE = 0.8
 """Texels of the irradiance per pixel along an edge, of a scan and in burning light: the edges of cast shadows are about
 as sharp as the pictures."""
+LEAST_LAMP_DISTANCE = 300.0
+"""mm from the head's origin: nearer, a lamp would stand among hair and shoulders."""
 RELIGHT_YAWS_DEG = {"front": 0.0, "left15": -15.0, "right15": 15.0}
 
 
@@ -70,7 +74,9 @@ class SynthesisSettings:
     disk. face_truth_only: gt/mesh.obj holds the face without the rest of the head. chart: a colour chart stands beside
     the head, and the picture is half as wide again to hold it. specular_scale: factor on the specular intensity;
     0: matte. clipped: share of the face's skin on which a channel burns out, over the clip; 0: the light is as bright
-    as FACE_RADIANCE says. scan: folder of a subject whose ground truth takes the procedural head's place.
+    as FACE_RADIANCE says. lamp_distance_mm: of the lamps of the clip's light from the head's mean place, where they
+    then give the irradiance that they give far away; 0: they are far away. scan: folder of a subject whose ground truth
+    takes the procedural head's place.
     """
 
     size: int = 400
@@ -93,6 +99,7 @@ class SynthesisSettings:
     chart: bool = False
     specular_scale: float = 1.0
     clipped: float = 0.0
+    lamp_distance_mm: float = 0.0
     scan: str | None = None
     irradiance: IrradianceQuality = IrradianceQuality()
     picture: PictureQuality = PictureQuality()
@@ -117,10 +124,12 @@ def synthesize(destination: Path, settings: SynthesisSettings, processes: int) -
     distance, height = camera_place(mesh, settings)
     chart = place_chart(distance, height, settings.seed) if settings.chart else None
     shots = plan_shots(mesh, settings)
+    lamps_at = near_lamps(shots[:settings.frames], settings.lamp_distance_mm)
     if settings.clipped:
-        gain = burning_gain(Scene(mesh, materials, lights[:1]), shots[:settings.frames], settings, processes)
+        scene = Scene(mesh, materials, lights[:1], lamps_at=lamps_at)
+        gain = burning_gain(scene, shots[:settings.frames], settings, processes)
         lights = (np.float32(gain) * lights[0], *lights[1:])
-    scene = Scene(mesh, materials, lights, chart)
+    scene = Scene(mesh, materials, lights, chart, lamps_at)
     width = round(WITH_CHART * settings.size) if settings.chart else settings.size
     camera = PinholeCamera(width, settings.size, settings.focal_mm / SENSOR_MM * settings.size)
     truth = np.unique(np.linspace(0, settings.frames - 1, settings.truth_frames).round().astype(int))
@@ -153,6 +162,13 @@ def scanned(settings: SynthesisSettings) -> tuple[Mesh, Mesh, Materials]:
     """As procedural, of a scan."""
     mesh, materials = read_scan(Path(settings.scan))
     return mesh, mesh, materials
+
+
+def near_lamps(shots: list[SyntheticShot], distance_mm: float) -> LampSphere | None:
+    """Lamps at a distance from the mean place of the head's origin in the shots, world space; 0: far away, None."""
+    if not distance_mm:
+        return None
+    return LampSphere(np.mean([shot.place for shot in shots], axis=0), distance_mm)
 
 
 def burning_gain(scene: Scene, shots: list[SyntheticShot], settings: SynthesisSettings, processes: int) -> float:
@@ -253,6 +269,8 @@ def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
     parser.add_argument("--specular", dest="specular_scale", type=float,
                         help="factor on the skin's specular intensity; 0: matte")
     parser.add_argument("--clipped", type=float, help="share of the face's skin on which a channel burns out")
+    parser.add_argument("--lamp-distance", dest="lamp_distance_mm", type=float, metavar="MM",
+                        help="the lamps of the clip's light stand so far from the head, mm; 0: far away (default)")
     parser.add_argument("--scan", metavar="SUBJECT",
                         help="subject whose ground truth takes the procedural head's place")
     parser.add_argument("--chart", action="store_true", help="a colour chart beside the head, in a wider picture")
@@ -261,7 +279,7 @@ def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
     settings = PRESETS[options.preset]
     given = {name: getattr(options, name) for name in
              ("size", "frames", "seed", "eyes", "tone", "noise", "focal_mm", "yaw_deg", "pitch_deg", "specular_scale",
-              "clipped", "scan")}
+              "clipped", "lamp_distance_mm", "scan")}
     settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
     settings = replace(settings, chart=options.chart)
     if options.light:
@@ -277,6 +295,11 @@ def _checked(settings: SynthesisSettings) -> SynthesisSettings:
         value = getattr(settings, name)
         if not low <= value <= high:
             raise InputError("out of range", where=f"--{name.split('_')[0]}", got=value, expected=f"{low} to {high}")
+    if settings.lamp_distance_mm and settings.lamp_distance_mm < LEAST_LAMP_DISTANCE:
+        raise InputError("a lamp inside the head's reach", where="--lamp-distance", got=settings.lamp_distance_mm,
+                         expected=f"{LEAST_LAMP_DISTANCE:g} mm or more, or 0: far away")
+    if settings.lamp_distance_mm and settings.chart:
+        raise InputError("the chart's light is far away", where="--lamp-distance with --chart", hint="leave out one")
     if settings.scan and settings.face_truth_only:
         raise InputError("a scan is too large for it", where="--preset tiny", hint="use the preset demo")
     if settings.scan or settings.clipped:

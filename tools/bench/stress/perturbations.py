@@ -68,6 +68,11 @@ def _between(other: StressScene, share: float, exposure: float = 1.0) -> StressC
     return StressCase(mix=((StressScene(), 1.0 - share), (other, share)), sensor=Sensor(exposure=exposure))
 
 
+def _lamp_at(distance_mm: float) -> StressCase:
+    """Most of the light from one lamp at a distance."""
+    return _between(StressScene(light="lamp", lamp_mm=distance_mm), 0.7, 2**-0.6)
+
+
 PERTURBATIONS = (
     Perturbation("cap_lamp", "light that moves with the head", "share of the light", (0.3, 0.8),
                  lambda s: _between(StressScene(light="cap", on_head=True), s),
@@ -98,6 +103,8 @@ PERTURBATIONS = (
                  lambda s: _shot(exposure=2.0**s), r"overexposed"),
     Perturbation("hard_sun", "a single hard sun", "share of the light", (0.5, 1.0),
                  lambda s: _between(StressScene(light="lamp"), s, 2 ** (-0.85 * s)), r"hard (light|lamp|sun)|shadow"),
+    Perturbation("near_lamp", "a lamp that stands near", "1 / m, its nearness", (0.1, 1.0, 1 / 0.6, 2.5),
+                 lambda s: _lamp_at(1000.0 / s) if s else StressCase(), r"(light|lamp).*near|near (light|lamp)"),
     Perturbation("coloured_light", "red light from the left, blue from the right", "saturation", (0.5, 1.0),
                  lambda s: _seen(tint=s), r"coloured|tint"),
     Perturbation("glasses", "glasses", "mm, thickness of the rims", (0.8, 2.5),

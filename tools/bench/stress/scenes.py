@@ -23,7 +23,7 @@ from tools.synthesis.irradiance import IrradianceQuality
 from tools.synthesis.makeup import made_up, sweaty
 from tools.synthesis.render import RenderQuality, Scene, render
 from tools.synthesis.skin import Complexion, SkinPainter
-from tools.synthesis.subject import SENSOR_MM, SynthesisSettings, head_model, light_of, plan_shots
+from tools.synthesis.subject import SENSOR_MM, SynthesisSettings, head_model, light_of, near_lamps, plan_shots
 from tools.synthesis.surface import Materials
 from tools.synthesis.wear import coloured, with_beard, with_fringe, with_glasses
 
@@ -43,13 +43,15 @@ SMILE_TIMES = ((0.40, 0.5), (0.44, 1.0), (0.66, 0.5), (0.70, 0.0))
 
 @dataclass(frozen=True)
 class StressScene:
-    """light: one of ENVIRONMENTS; on_head: it turns with the head; tint: how coloured the two sides are, 0 to 1.
+    """light: one of ENVIRONMENTS; on_head: it turns with the head; lamp_mm: how far its lamps stand, 0: far away; tint:
+    how coloured the two sides are, 0 to 1.
 
     tone: melanin; makeup, wet, fringe: shares; glasses_mm, beard_mm: thickness; smile: what comes and goes mid-clip.
     """
 
     light: str = "room"
     on_head: bool = False
+    lamp_mm: float = 0.0
     tint: float = 0.0
     tone: float = 0.35
     makeup: float = 0.0
@@ -93,10 +95,11 @@ def render_scene(scene: StressScene, folder: Path, processes: int = 1) -> Path:
     shots = plan_shots(states[0][0].mesh, settings)
     if scene.on_head:
         shots = [replace(shot, world_from_head=np.eye(3)) for shot in shots]
+    lamps_at = near_lamps(shots, scene.lamp_mm)
     (done / "gt").mkdir(parents=True, exist_ok=True)
     pictures: list[np.ndarray | None] = [None] * scene.frames
     for number, (head, materials, index) in enumerate(states):
-        scene = Scene(head.mesh, materials, (light,))
+        scene = Scene(head.mesh, materials, (light,), lamps_at=lamps_at)
         if number == 0:
             output.write_scene_truth(done / "gt", scene, head.mesh, 10)
         quality = RenderQuality(settings.irradiance, settings.picture, settings.seed)
