@@ -49,7 +49,7 @@ MAY_IMPORT = {
         "shared tools.cli tools.synthesis tools.scoring tools.bench.runner tools.bench.drawing",
     "tools.bench":
         "shared stages tools.synthesis tools.scoring tools.bench.runner tools.bench.drawing tools.bench.peers "
-        "tools.bench.chart tools.bench.stress",
+        "tools.bench.chart tools.bench.stress tools.relight",
     "tools.setup.head_model": "shared",
     "tools.setup": "shared tools.bench.peers tools.setup.head_model",
     "tools.documents": "shared tools.bench.chart",

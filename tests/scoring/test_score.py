@@ -117,6 +117,47 @@ def test_a_similarity_moves_points_and_poses_alike():
                                SCALE * (points @ pose[:3, :3].T + pose[:3, 3]), atol=1e-9)
 
 
+def test_coverage_of_errors_whose_covariance_is_known():
+    rng = np.random.default_rng(0)
+    axes = rotation_from_vector(rng.normal(size=(4000, 3)))
+    spread = axes * np.radians([0.05, 0.1, 0.3])
+    covariance, errors = spread @ spread.transpose(0, 2, 1), (spread @ rng.normal(size=(4000, 3, 1)))[..., 0]
+    assert measures.rotation_coverage(errors, covariance) == pytest.approx(0.9, abs=0.015)
+    # Three standard deviations where one is stated: chi-squared below 6.251 / 9, three degrees of freedom.
+    assert measures.rotation_coverage(3.0 * errors, covariance) == pytest.approx(0.126, abs=0.015)
+
+
+def test_acceleration_of_known_sequences():
+    index = np.arange(20)
+    steady = np.radians(0.3) * index[:, None] * np.array([0.0, 0.6, 0.8])
+    assert measures.rotation_acceleration_deg(steady, index) == pytest.approx(0.0, abs=1e-9)
+    bent = np.radians(0.25) * index[:, None] ** 2 * np.array([0.0, 0.6, 0.8])
+    assert measures.rotation_acceleration_deg(bent, index) == pytest.approx(0.5)
+    every_other = index[::2]
+    assert measures.rotation_acceleration_deg(bent[::2], every_other) == pytest.approx(0.5)
+    # A gap is no bend.
+    gap = np.delete(index, [7, 8])
+    assert measures.rotation_acceleration_deg(bent[gap], gap) == pytest.approx(0.5)
+    assert np.isnan(measures.rotation_acceleration_deg(bent[:2], index[:2]))
+
+
+def test_confident_albedo_is_judged_by_itself():
+    """Grey skin; where the result is sure it lacks a gain alone, and one pixel in fifty is far off."""
+    rng = np.random.default_rng(0)
+    truth = np.full((5000, 3), 0.3) + rng.uniform(-0.02, 0.02, (5000, 1))
+    confidence = np.where(np.arange(5000) < 4000, 0.9, 0.2)
+    result = np.where(confidence[:, None] > 0.5, truth / GAIN, 0.9)
+    wrong = np.arange(0, 4000, 50)
+    exact = measures.albedo_errors(truth, result, rng, confidence)["confident"]
+    assert exact["share"] == pytest.approx(0.8) and exact["acceptable"] == 1.0
+    assert exact["delta_e2000_p99"] < 1e-3 and exact["psnr_linear"] > 100
+    result[wrong] *= 3.0
+    spoiled = measures.albedo_errors(truth, result, rng, confidence)["confident"]
+    assert spoiled["acceptable"] == pytest.approx(1 - len(wrong) / 4000) and spoiled["delta_e2000_p99"] > 20
+    assert measures.albedo_errors(truth, result, rng, np.zeros(5000))["confident"] == {"share": 0.0}
+    assert "confident" not in measures.albedo_errors(truth, result, rng)
+
+
 def test_measures_have_their_closed_forms():
     grey = np.full((500, 3), 0.25)
     assert measures.psnr(grey, grey + 0.01) == pytest.approx(40)

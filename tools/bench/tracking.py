@@ -30,11 +30,10 @@ from shared.tracking.pose_uncertainty import rotations_apart
 from stages.sample_frames import STAGE as SAMPLED
 from stages.track_landmarks import STAGE as TRACKED
 from tools.bench.runner import Bench, Entry, measured
+from tools.scoring.measures import rotation_coverage
 from tools.scoring.score import score_geometry
 
 STAGES = ("sample_frames", "track_landmarks")
-COVERED_CHI_SQUARED = 6.251
-"""90 % of a chi-squared variable of three degrees of freedom."""
 
 COLUMNS = (
     "case", "frames", "excluded", "rotation_mean_deg", "rotation_max_deg", "jitter_deg", "across_mm", "depth_mm",
@@ -61,8 +60,6 @@ def errors_of(subject: Path, work: Path) -> dict[str, object]:
     poses = found["camera_from_head"]
     apart = rotations_apart(poses[:, :3, :3], true[:, :3, :3])
     angle = np.degrees(np.linalg.norm(apart, axis=1))
-    rotation_covariance = found["covariance"][:, :3, :3]
-    distance = np.einsum("fi,fi->f", apart, np.linalg.solve(rotation_covariance, apart[..., None])[..., 0])
     alignment, geometry = score_geometry(
         subject, load_mesh(tracked / "mesh.npz"), true, poses, np.random.default_rng(0)
     )
@@ -75,7 +72,7 @@ def errors_of(subject: Path, work: Path) -> dict[str, object]:
         "jitter_deg": np.degrees(np.linalg.norm(np.diff(apart, axis=0), axis=1)).mean(),
         "across_mm": np.linalg.norm(off[:, :2], axis=1).mean(),
         "depth_mm": np.abs(off[:, 2]).mean(),
-        "covered": (distance < COVERED_CHI_SQUARED).mean(),
+        "covered": rotation_coverage(apart, found["covariance"][:, :3, :3]),
         "geometry_median_mm": geometry["geometry_mm"]["median"],
         "geometry_p95_mm": geometry["geometry_mm"]["p95"],
         "reprojection_px": record["reprojection_px"]["median"],

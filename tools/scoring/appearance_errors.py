@@ -13,8 +13,6 @@ from shared.io.images import read_exr, read_png
 from tools.scoring import measures
 from tools.scoring.buffers import BufferRenderer as BufferViewer
 
-CONFIDENT = 0.5
-
 
 def map_errors(
     subject: Path, inputs: ClipInputs, index: np.ndarray, mesh: Mesh, maps: dict[str, np.ndarray]
@@ -39,7 +37,7 @@ def map_errors(
             truth = read_exr(f"{stem}_{name}.exr")[row[hit], column[hit]].reshape(hit.sum(), -1)
             pairs[name].append((truth[:, : found.shape[1]], found))
     joined = {name: tuple(np.concatenate(side) for side in zip(*both, strict=True)) for name, both in pairs.items()}
-    is_confident = np.concatenate(confidence) > CONFIDENT
+    is_confident = np.concatenate(confidence) > measures.CONFIDENT
     result = _albedo_errors(*joined["albedo"], np.concatenate(confidence))
     result["confident_share"] = float(is_confident.mean())
     for name in ("specular", "roughness"):
@@ -53,7 +51,7 @@ def _albedo_errors(truth: np.ndarray, found: np.ndarray, confidence: np.ndarray)
     """[N, 3] pairs and confidence [N]: all of them, and those where the clip saw light, with gains from there: what it
     did not see must not set them."""
     errors, apart, gain = _aligned_errors(truth, found)
-    sure = confidence > CONFIDENT
+    sure = confidence > measures.CONFIDENT
     confident = _aligned_errors(truth[sure], found[sure])[0] if sure.any() else dict.fromkeys(errors, float("nan"))
     edges = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 0.97, 1.001])
     bins = [(confidence >= low) & (confidence < high) for low, high in zip(edges[:-1], edges[1:], strict=True)]

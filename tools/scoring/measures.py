@@ -11,7 +11,11 @@ import numpy as np
 from shared.geometry.transforms import camera_centres, nearest_rotation, similarity_from_points
 from shared.imaging.color import delta_e_2000, encode_srgb
 
+COVERED_CHI_SQUARED = 6.251
+"""90 % of a chi-squared variable of three degrees of freedom."""
 DELTA_E_SAMPLES = 100_000
+CONFIDENT, ACCEPTABLE_DELTA_E = 0.5, 8.0
+"""Confidence from which on a texel counts as seen, and the dE2000 that no such texel should exceed."""
 CLIPPED = 0.98
 ENVMAP_WIDTH = 96
 ENVMAP_LOBE_SHARPNESS = 12.0
@@ -66,13 +70,39 @@ def pose_errors_own_alignment(truth: np.ndarray, result: np.ndarray) -> dict:
     }
 
 
+def rotation_coverage(apart: np.ndarray, covariance: np.ndarray) -> float:
+    """Share of frames whose rotation error lies within the 90 % region that its covariance states.
+
+    apart [F, 3]: rotation vectors from the truth; covariance [F, 3, 3] about the same axes, radians squared.
+    """
+    distance = np.einsum("fi,fi->f", apart, np.linalg.solve(covariance, apart[..., None])[..., 0])
+    return float((distance < COVERED_CHI_SQUARED).mean())
+
+
+def rotation_acceleration_deg(apart: np.ndarray, frame_index: np.ndarray) -> float:
+    """Mean length of the second difference of rotation errors: how much poses tremble, degrees per frame squared.
+
+    apart [F, 3]: rotation vectors from the truth, radians; frame_index [F]. Three poses in a row count where they are
+    evenly spaced; a spacing of d frames divides by d squared. NaN where there are none.
+    """
+    step = np.diff(frame_index)
+    even = step[1:] == step[:-1]
+    change = np.diff(apart, n=2, axis=0)[even] / step[1:][even, None] ** 2
+    return float(np.degrees(np.linalg.norm(change, axis=1)).mean()) if even.any() else float("nan")
+
+
 def albedo_differences(truth: np.ndarray, result: np.ndarray) -> np.ndarray:
     """[N,3] linear albedo pairs -> dE2000 [N]; what is negative counts as black."""
     return delta_e_2000(np.clip(truth, 0, None), np.clip(result, 0, None))
 
 
-def albedo_errors(truth: np.ndarray, result: np.ndarray, rng: np.random.Generator) -> dict:
-    """[N,3] linear albedo pairs -> PSNR, RMSE and median dE2000, with three, one and no gain removed."""
+def albedo_errors(
+    truth: np.ndarray, result: np.ndarray, rng: np.random.Generator, confidence: np.ndarray | None = None
+) -> dict:
+    """[N,3] linear albedo pairs -> PSNR, RMSE and median dE2000, with three, one and no gain removed.
+
+    confidence [N] of the result, where it states one: `confident` then has the errors where it is above CONFIDENT.
+    """
     truth, result = truth.astype(np.float64), result.astype(np.float64)
     gain = channel_gain(truth, result)
     common = (truth * result).sum() / max((result * result).sum(), 1e-12)
@@ -87,7 +117,27 @@ def albedo_errors(truth: np.ndarray, result: np.ndarray, rng: np.random.Generato
             "delta_e2000_median": float(np.median(difference)),
         }
     scores["gain"] = gain.tolist()
+    if confidence is not None:
+        scores["confident"] = confident_errors(truth[subset], result[subset], confidence[subset])
     return scores
+
+
+def confident_errors(truth: np.ndarray, result: np.ndarray, confidence: np.ndarray) -> dict[str, float]:
+    """[N,3] linear albedo pairs and confidence [N] -> the share of confident ones, and their dE2000 after one gain per
+    channel, taken from them alone: what the clip did not see must not set it. Where none is confident, no dE2000."""
+    sure = confidence > CONFIDENT
+    scores = {"share": float(sure.mean())}
+    if not sure.any():
+        return scores
+    truth, result = truth[sure].astype(np.float64), result[sure].astype(np.float64)
+    result = result * channel_gain(truth, result)
+    difference = albedo_differences(truth, result)
+    return scores | {
+        "delta_e2000_median": float(np.median(difference)),
+        "delta_e2000_p99": float(np.percentile(difference, 99)),
+        "acceptable": float((difference < ACCEPTABLE_DELTA_E).mean()),
+        "psnr_linear": psnr(truth, result),
+    }
 
 
 def scalar_errors(truth: np.ndarray, result: np.ndarray) -> dict[str, float]:

@@ -7,7 +7,8 @@ Reads:   SUBJECT/capture.json, gt/{mesh.obj,mask.exr,envmap.exr,poses.npz,frames
          relight/NAME_radiance.exr).
 Measures: geometry_mm    distance of the true face's points to the result's surface, after alignment
          pose            rotation and translation in the aligned head frame; pose_own_alignment leaves the mesh out
-         normal_deg, albedo, specular, roughness    in image space, on the face skin of the frames that hold truth
+         normal_deg, albedo, specular, roughness    in image space, on the face skin of the frames that hold truth;
+                         albedo.confident: where maps/confidence.exr, if there is one, is above 0.5
          envmap          through a cosine and a 25 degree lobe, per-channel gain removed
          rerender, relight   sRGB-coded PSNR on the face skin, raw and with one gain per channel
 Frames:  the result's head frame and scale may be any; it is aligned by a similarity transform (camera centres first,
@@ -37,7 +38,8 @@ from tools.scoring.buffers import BufferRenderer
 from tools.scoring.table import table
 
 SCORED_FRAMES = 12
-MAPS = {"albedo": "diffuse_albedo", "specular": "specular_intensity", "roughness": "roughness"}
+CONFIDENCE = "confidence"
+MAPS = {"albedo": "diffuse_albedo", "specular": "specular_intensity", "roughness": "roughness", CONFIDENCE: CONFIDENCE}
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,8 @@ def score_appearance(
     """Normals, coverage, textures and re-renders on the face skin of the given frames."""
     viewer = BufferRenderer(result.mesh, result.textures)
     angles, coverage, rendered = [], [], []
-    pairs: dict[str, list] = {name: [] for name in result.textures}
+    pairs: dict[str, list] = {name: [] for name in result.textures if name != CONFIDENCE}
+    confidence = []
     for frame in frames:
         stem = subject / "gt" / "frames" / f"{frame:04d}"
         mask = read_png(Path(f"{stem}_mask.png")) > 127
@@ -147,6 +150,8 @@ def score_appearance(
         )
         for name in pairs:
             pairs[name].append((read_exr(f"{stem}_{name}.exr")[row, column], seen[name][hit]))
+        if CONFIDENCE in seen:
+            confidence.append(seen[CONFIDENCE][hit].ravel())
         render = find_image(result.folder / "renders", f"{frame:04d}")
         if render:
             rendered.append((read_exr(f"{stem}_radiance.exr")[mask], read_linear(render)[mask]))
@@ -157,7 +162,7 @@ def score_appearance(
     for name, frame_pairs in pairs.items():
         truth, found = (np.concatenate(side) for side in zip(*frame_pairs, strict=True))
         scores[name] = (
-            measures.albedo_errors(truth, found, rng)
+            measures.albedo_errors(truth, found, rng, np.concatenate(confidence) if confidence else None)
             if name == "albedo"
             else measures.scalar_errors(truth, found)
         )

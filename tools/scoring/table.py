@@ -12,6 +12,10 @@ LIGHT = (
     "{lobe25_rel_rmse:.1%}, front {lobe25_front_rel_rmse:.1%}"
 )
 ALBEDO = "dE2000 median {delta_e2000_median:.2f}, {psnr_srgb:.1f} dB sRGB, {psnr_linear:.1f} dB linear"
+CONFIDENT = (
+    "confident dE2000 median {delta_e2000_median:.2f}, p99 {delta_e2000_p99:.2f}, within 8 {acceptable:.1%}; "
+    "{share:.1%} of the pixels"
+)
 ALBEDO_NAMES = {"aligned": "aligned  ", "aligned_one_gain": "one gain ", "raw": "raw      "}
 
 
@@ -38,6 +42,8 @@ def _appearance_lines(scores: dict) -> list[tuple[str, str]]:
     lines = []
     if "albedo" in scores:
         lines += [("albedo", title + ALBEDO.format(**scores["albedo"][name])) for name, title in ALBEDO_NAMES.items()]
+        if "acceptable" in (confident := scores["albedo"].get("confident", {})):
+            lines.append(("albedo", CONFIDENT.format(**confident)))
     lines += [(name, SCALAR.format(**scores[name])) for name in ("specular", "roughness") if name in scores]
     if "envmap" in scores:
         lines.append(("light", LIGHT.format(**scores["envmap"])))
