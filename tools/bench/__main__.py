@@ -16,6 +16,7 @@ BENCHES = {
     "compared": "published:ComparedBench",
     "tracking": "tracking:TrackingBench",
     "backwards": "tracking:BackwardsBench",
+    "hard_light": "hard_light:HardLightBench",
     "colour_chart": "colour_chart:ColourChartBench",
     "shading": "shading:ShadingBench",
     "profile": "profile:ProfileBench",

@@ -140,9 +140,10 @@ class Clock:
         self._stopped = None
 
 
-def measured(command: Sequence[str], log: Path) -> dict[str, float]:
+def measured(command: Sequence[str], log: Path, well: Sequence[int] = (0,)) -> dict[str, float]:
     """Runs a command to its end -> its wall_s and cpu_s, and `others`, the cores that other work kept busy meanwhile.
-    Its memory only the process itself can tell from that of its parent. InputError with its last words if it fails."""
+    Its memory only the process itself can tell from that of its parent. InputError with its last words if its exit code
+    is none of `well`."""
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = os.environ | {"PYTHONHASHSEED": "0", "LIMN_PARENT": str(os.getpid())}
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(REPOSITORY), os.environ.get("PYTHONPATH", "")]))
@@ -157,7 +158,7 @@ def measured(command: Sequence[str], log: Path) -> dict[str, float]:
             raise
     process.returncode = os.waitstatus_to_exitcode(status)
     wall, cpu = time.perf_counter() - began, usage.ru_utime + usage.ru_stime
-    if process.returncode:
+    if process.returncode not in well:
         words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no message"]
         ended = f"exit code {process.returncode}; its log: {log}"
         raise InputError("failed", where=" ".join(command[:6]), got=words[-1], hint=ended)
