@@ -88,7 +88,7 @@ def constant_light(radiance: tuple = (1.0, 2.0, 3.0)) -> EnvironmentLight:
 def irradiance_of(surface: SyntheticSurface, lights: list, shots: list[SyntheticShot],
                   quality: IrradianceQuality) -> np.ndarray:
     groups = [group_irradiance(surface, lights, shots, group, quality, 0) for group in range(quality.groups)]
-    return assemble_atlas(surface, groups, quality.size)
+    return assemble_atlas(surface, groups, quality.size, quality.bounces)
 
 
 FRONT_SHOT = SyntheticShot(FRONT, np.eye(3), 0, 1)
@@ -113,12 +113,16 @@ def test_a_globe_in_a_white_furnace_reflects_its_albedo_and_the_lobe():
     assert np.abs(found - expected)[middle].mean() < 0.01
 
 
-def test_a_half_sphere_bowl_under_a_white_sky_has_its_known_irradiance():
+@pytest.mark.parametrize("bounces", [0, 1, IrradianceQuality.bounces])
+def test_a_half_sphere_bowl_under_a_white_sky_has_its_known_irradiance(bounces):
     """Between two points of a sphere the form factor is constant, dA / (4 pi R^2): from anywhere inside a half sphere
-    half of the light is blocked, and one bounce returns albedo / 2 of what arrives: E = pi L / 2 (1 + albedo / 2)."""
+    half of the light is blocked, and each bounce returns albedo / 2 of what arrived, all of them together
+    E = pi L / 2 / (1 - albedo / 2)."""
     surface = SyntheticSurface(round_mesh(80.0, np.pi / 2, inward=True), plain())
-    irradiance = irradiance_of(surface, [constant_light((1, 1, 1))], [FRONT_SHOT], COARSE)[4:-4, :, 0]
-    expected = 0.5 * np.pi * (1 + 0.5 * np.array(ALBEDO))
+    quality = replace(COARSE, bounces=bounces)
+    irradiance = irradiance_of(surface, [constant_light((1, 1, 1))], [FRONT_SHOT], quality)[4:-4, :, 0]
+    share = 0.5 * np.array(ALBEDO)
+    expected = 0.5 * np.pi * (1 - share ** (bounces + 1)) / (1 - share)
     np.testing.assert_allclose(irradiance.mean((0, 1)), expected, rtol=0.015)
 
 

@@ -96,7 +96,7 @@ def render(scene: Scene, shots: list[SyntheticShot], camera: PinholeCamera, qual
     with _workers(processes, (scene, shots, camera, quality)) as spread:
         groups = list(spread("irradiance", range(quality.irradiance.groups)))
         surface = SyntheticSurface(scene.mesh, scene.materials)
-        atlas = assemble_atlas(surface, groups, quality.irradiance.size)
+        atlas = assemble_atlas(surface, groups, quality.irradiance.size, quality.irradiance.bounces)
         del groups
         tasks = ((i, np.ascontiguousarray(atlas[:, :, i]), with_buffers[i]) for i in range(len(shots)))
         yield from spread("picture", tasks)

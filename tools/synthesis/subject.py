@@ -9,7 +9,7 @@ Writes:  DEST/subject.yaml, capture.json, the clip (video.avi, or frames/%04d.pn
          stand near lamp.json, and for some frames frames/NNNN_*.exr and .png; relight/: the same head under other
          lights. tools/score.py reads all of it.
 Method:  a random head of the head model with procedural skin, bumps and bust, or the scan of another subject; a
-         procedural light; direct light with one diffuse bounce and the GGX lobe, traced with embree (irradiance,
+         procedural light; direct light with its diffuse bounces and the GGX lobe, traced with embree (irradiance,
          camera); sensor noise, 8-bit sRGB.
 The clip is FFV1 in AVI: of the encoders in OpenCV's wheel the lossy ones shift colours by 2 to 3 codes on their way
 through YUV 4:2:0, FFV1 returns every code value. The same arguments give the same bytes, whatever the number of
@@ -110,7 +110,7 @@ PRESETS = {
     "tiny": SynthesisSettings(size=144, frames=12, level=0, texture=128, truth_frames=1, mantissa_bits=4,
                               face_truth_only=True, lights=("room",), light_height=32, noise=0.0015,
                               video="frames/%04d.png",
-                              irradiance=IrradianceQuality(size=160, directions=768)),
+                              irradiance=IrradianceQuality(size=160, directions=768, bounces=1)),
 }
 
 

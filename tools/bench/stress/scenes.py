@@ -32,7 +32,7 @@ SETTINGS = SynthesisSettings(size=224, frames=24, level=1, texture=512, truth_fr
                              irradiance=IrradianceQuality(size=128, directions=512, lamp_samples=16),
                              picture=PictureQuality(sub=2, lobe_samples=1, lamp_samples=2))
 """Small, so that a run takes less than a minute on one core; the face is 115 px high."""
-RECIPE = 1
+RECIPE = 2
 """Raise it whenever SETTINGS or the code that renders give other pictures: kept scenes and rows are then not used."""
 TINTS = np.array([[1.0, 0.12, 0.1], [0.1, 0.25, 1.0]])
 """Colours of the light from the left and from the right."""
