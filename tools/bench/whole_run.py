@@ -123,11 +123,11 @@ def detail_row(run: Path) -> dict[str, float]:
     which are first brought to the final head frame."""
     sampled, tracked, solved = (run / "work" / stage for stage in ("sample_frames", "track_landmarks",
                                                                    "inverse_render"))  # fmt: skip
-    inputs = read_inputs(sampled, tracked)
-    if inputs.tracked is None:
-        raise InputError("poses were given, not tracked", where=str(tracked))
-    path, final = solved / "mesh.npz", load_arrays(solved / "poses.npz")["camera_from_head"]
-    surface = Surface(load_mesh(path), load_arrays(path)["face_segment"], inputs.surface.segment_names)
+    inputs, path = read_inputs(sampled, tracked), solved / "mesh.npz"
+    final, segment = load_arrays(solved / "poses.npz")["camera_from_head"], load_arrays(path).get("face_segment")
+    if inputs.tracked is None or segment is None:
+        raise InputError("poses or mesh were given, not tracked", where=str(solved), expected="what was tracked")
+    surface = Surface(load_mesh(path), segment, inputs.surface.segment_names)
     clip, depth = inputs.tracked.look(), float(np.median(final[:, 2, 3]))
     tracker = AtlasTracker(clip, surface.mesh, ~surface.faces_of(UNTRACKED_SEGMENTS), depth, FINE)
     both = final, in_head_frame_of(inputs.views.camera_from_head, final)
