@@ -8,10 +8,9 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sparse
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse.linalg import SuperLU
 
 from shared.compute.compiled import compiled
-from shared.compute.sparse_solve import factorised, solved_by_factors_of_another
+from shared.compute.sparse_solve import Factors, factorised, solved_by_factors_of_another
 from shared.compute.threads import share_out
 from shared.geometry.mesh import Mesh, rasterize_uv, vertex_adjacency
 from shared.imaging.image_sampling import Picture, View, sample_colours, sample_inside, sample_saturation, texel_size
@@ -149,7 +148,7 @@ class SmoothFields:
         graph = sparse.diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency
         self._least = 1.0 / spread**2
         self._prior = (graph / step**2 + sparse.identity(count) * self._least).tocsr()
-        self._factors: SuperLU | None = None
+        self._factors: Factors | None = None
 
     def through(self, values: np.ndarray, precision: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Most likely vertex values [V, C, ...], given values [V, C, ...] of some precision [V, C]; mean [C]."""

@@ -5,6 +5,7 @@ import pytest
 import scipy.sparse as sparse
 
 from shared.compute.sparse_solve import factorised, solved_by_factors_of_another
+from shared.compute.threads import share_out
 
 
 def test_it_solves_a_membrane():
@@ -32,3 +33,13 @@ def test_factors_of_another_matrix_give_the_same_solution(unlike):
     found = solved_by_factors_of_another(matrix, right, factorised(chain + sparse.identity(count)))
     assert np.allclose(found, np.linalg.solve(matrix.toarray(), right), rtol=1e-6, atol=1e-7 / unlike)
     assert not found[:, 2].any()
+
+
+def test_threads_may_solve_by_the_same_factors():
+    count = 400
+    chain = sparse.diags([-np.ones(count - 1), 2.5 * np.ones(count), -np.ones(count - 1)], [-1, 0, 1])
+    right = np.random.default_rng(0).normal(size=(count, 8))
+    for _ in range(20):
+        factors = factorised(chain.astype(np.float32))
+        found = share_out(8, lambda k, factors=factors: solved_by_factors_of_another(chain, right[:, [k]], factors))
+        np.testing.assert_allclose(chain @ np.concatenate(found, axis=1), right, atol=1e-6)
