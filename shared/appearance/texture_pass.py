@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -14,6 +15,7 @@ from shared.appearance.texture import (
     PRIOR_SPREAD,
     BorderSums,
     Evidence,
+    MisfitSums,
     Noise,
     NormalEquations,
     TexelMaterial,
@@ -118,15 +120,16 @@ class TexturePass:
     def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> Evidence:
         parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]
         borders = [BorderSums(len(self.surface), self.viewer.error_mm) for _ in self.systematic]
+        misfits = [MisfitSums(len(self.surface), self.noise) for _ in self.systematic]
         ahead = work_ahead(self.view, self.progress(frames, label))
         for f, view in zip(frames, ahead, strict=True):
-            part, border = parts[self.views.light_index[f]], borders[self.views.light_index[f]]
-            self._share_out(view, lambda lit, part=part, border=border: self._add(material, part, border, lit))
+            part, border, misfit = (sums[self.views.light_index[f]] for sums in (parts, borders, misfits))
+            self._share_out(view, partial(self._add, material, part, border, misfit))
         for part, weight in zip(parts, self.light_weights, strict=True):
             part.scale(weight)
         systematic = [error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
-                      + part.highlight_variance(self.specular)
-                      for error, border, part in zip(self.systematic, borders, parts, strict=True)]
+                      + part.highlight_variance(self.specular) + misfit.variance()
+                      for error, border, part, misfit in zip(self.systematic, borders, parts, misfits, strict=True)]
         return weigh_lights(parts, systematic, self.typical_albedo)
 
     def view(self, f: int) -> FrameView:
@@ -148,13 +151,19 @@ class TexturePass:
 
         return share_out(len(blocks), of_block)
 
-    def _add(self, material: TexelMaterial | None, part: NormalEquations, border: BorderSums, lit: LitSamples) -> None:
-        """A block's samples to its light's sums; without a material every sample that is not at a limit counts."""
+    def _add(
+        self, material: TexelMaterial | None, part: NormalEquations, border: BorderSums, misfit: MisfitSums,
+        lit: LitSamples,
+    ) -> None:
+        """A block's samples to its light's sums; without a material every sample that is not at a limit counts, and
+        nothing is known of misfits."""
         samples = lit.samples
         if material is None:
             robust = (samples.saturation == 0).astype(np.float32)
         else:
-            robust = robust_weight(lit.model(material), samples, self.noise, material.information, lit.shadow)
+            model = lit.model(material)
+            robust = robust_weight(model, samples, self.noise, material.information, lit.shadow)
+            misfit.add(samples, model, material.albedo[samples.rows] * lit.irradiance, lit.shadow)
         part.add(samples, lit.irradiance, lit.reflection, robust, lit.shadow)
         border.add(samples)
 
@@ -162,19 +171,26 @@ class TexturePass:
         self, evidence: Evidence, intensities: list[np.ndarray], fields: SmoothFields
     ) -> list[TexelMaterial]:
         """Albedo for each of some given intensities [T]; channels left open by the samples follow the others and the
-        neighbourhood."""
+        neighbourhood.
+
+        A channel whose samples have the share q of its albedo leaves 1 - q to a fallback. The texel's brightness b
+        beside its neighbourhood, by all channels, is believed by their share q': the fallback has b (q' - q) / (1 - q)
+        of it, so that channels that know alike get what their own samples say once, and one that is clipped gets q' b.
+        """
         equations, information, systematic = evidence.equations, evidence.information, evidence.systematic
         rough = [equations.solve_albedo(specular, 0.0, 1e-6) for specular in intensities]
         around = self._surroundings(rough, information, fields).astype(np.float32)
-        certain = information / (1.0 + information)
-        determined = (PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + systematic)).mean(1)
         pull = _ALBEDO_PULL + equations.ee * (systematic / PRIOR_SPREAD**2)
+        own = equations.ee / (equations.ee + pull)
+        certain = own * information / (1.0 + information)
+        total = np.maximum(certain.sum(1, keepdims=True), 1e-9)
+        believed = (certain * own).sum(1, keepdims=True) / total
+        left = np.clip(believed - own, 0.0, 1.0) / np.maximum(1.0 - own, 1e-3)
         found = []
         for k, specular in enumerate(intensities):
             smooth = np.exp(self.surface.interpolate(around[..., k]))
-            # A texel's brightness by its certain channels, its colour otherwise the neighbourhood's.
-            brighter = (certain * np.log(np.maximum(rough[k], 1e-3) / smooth)).sum(1) / (certain.sum(1) + 0.3)
-            albedo = equations.solve_albedo(specular, smooth * np.exp(brighter * determined)[:, None], pull)
+            brighter = (certain * np.log(np.maximum(rough[k], 1e-3) / smooth)).sum(1, keepdims=True) / total
+            albedo = equations.solve_albedo(specular, smooth * np.exp(brighter * left), pull)
             found.append(TexelMaterial(albedo, specular, information.min(1)))
         return found
 

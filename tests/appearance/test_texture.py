@@ -6,8 +6,10 @@ from shapes import grid_plane
 
 from shared.appearance.texture import (
     LEAST_BORDER_MM,
+    MISFIT,
     PRIOR_SPREAD,
     BorderSums,
+    MisfitSums,
     Noise,
     NormalEquations,
     pooled_specular,
@@ -137,6 +139,35 @@ def test_errors_of_highlights_count_by_their_share():
     own = np.array([specular, 0.25, specular, specular])
     by_texel = accumulated(e, s, i, np.ones((6, 4))).highlight_variance(own)
     assert np.allclose(by_texel[[0, 2, 3]], variance[[0, 2, 3]]) and (by_texel[1] < 0.5 * variance[1]).all()
+
+
+def test_misfit_is_what_frames_contradict_each_other_by():
+    """Relative errors of +-0.4 in frames of one brightness have the variance 0.16; an error that all frames share is
+    the albedo's; clipped samples contradict nothing, and noise is no misfit."""
+    frames, texels, radiance = 400, 4, 0.3
+    rng = np.random.default_rng(0)
+    sigma = NOISE.absolute + NOISE.relative * radiance
+    colours = np.full((frames, texels, 3), radiance)
+    model = colours.copy()
+    model[:, 0] *= 1.0 + 0.4 * (-1.0) ** np.arange(frames)[:, None]
+    model[:, 1] *= 1.5
+    model[:, 2] += sigma * rng.normal(size=(frames, 3))
+    model[:, 3] *= 1.0 + 0.4 * (-1.0) ** np.arange(frames)[:, None]
+    saturation = np.zeros(colours.shape, np.int8)
+    saturation[:, 3] = 1
+    sums, rows = MisfitSums(texels, NOISE), np.arange(texels)
+    for f in range(frames):
+        samples = TexelSamples(rows, colours[f], np.full(texels, 0.5), saturation[f])
+        sums.add(samples, model[f], model[f], np.zeros((texels, 3)))
+    variance = sums.variance() / MISFIT
+    # About the best common factor, which is 1 / 1.16: sum (1.4 x - 1)^2 + (0.6 x - 1)^2 over sum of their squares.
+    best = 1.0 / 1.16
+    expected = ((1.4 * best - 1) ** 2 + (0.6 * best - 1) ** 2) / (1.4**2 + 0.6**2)
+    noise = sigma**2 / radiance**2 / 1.16
+    assert variance[0] == pytest.approx(expected - noise, rel=0.01)
+    assert variance[1].max() < 1e-6
+    assert variance[2].max() < 0.2 * sigma**2 / radiance**2
+    assert (variance[3] == 0.0).all()
 
 
 def test_robust_weights():
