@@ -9,7 +9,8 @@ from quick import TINY
 from shared.geometry.transforms import rigid, rotation_from_vector
 from shared.io.arrays import read_json
 from shared.tracking.texture_tracks import MeanContrast
-from tools.bench.whole_run import COLUMNS, gradient_energies, in_head_frame_of, main, pose_errors
+from tools.bench.whole_run import COLUMNS, gradient_energies, in_head_frame_of, main
+from tools.scoring.rotations import rotation_errors
 
 
 def test_poses_are_brought_into_another_head_frame():
@@ -26,7 +27,7 @@ def test_errors_of_poses_that_tremble_by_a_known_angle():
     found = true.copy()
     found[::2, :3, :3] = rotation_from_vector(np.radians([0.0, 0.2, 0.0]))
     covariance = np.tile(np.radians(0.1) ** 2 * np.eye(6), (10, 1, 1))
-    errors = pose_errors({"camera_from_head": found, "frame_index": np.arange(10), "covariance": covariance}, true)
+    errors = rotation_errors({"camera_from_head": found, "frame_index": np.arange(10), "covariance": covariance}, true)
     assert errors["rotation_mean_deg"] == pytest.approx(0.1, rel=1e-4)
     assert errors["rotation_max_deg"] == pytest.approx(0.1, rel=1e-4)
     assert errors["acceleration_deg"] == pytest.approx(0.4, rel=1e-4) and errors["covered"] == 1.0

@@ -30,7 +30,7 @@ from shared.tracking.pose_uncertainty import rotations_apart
 from stages.sample_frames import STAGE as SAMPLED
 from stages.track_landmarks import STAGE as TRACKED
 from tools.bench.runner import Bench, Entry, measured
-from tools.scoring.measures import rotation_coverage
+from tools.scoring.rotations import rotation_errors
 from tools.scoring.score import score_geometry
 
 STAGES = ("sample_frames", "track_landmarks")
@@ -56,10 +56,10 @@ def errors_of(subject: Path, work: Path) -> dict[str, object]:
     """Errors of one tracked subject against its truth."""
     tracked = work / "track_landmarks"
     found, record = load_arrays(tracked / "poses.npz"), read_json(tracked / "tracking.json")
-    true = load_arrays(subject / "gt" / "poses.npz")["camera_from_head"][found["frame_index"]]
-    poses = found["camera_from_head"]
+    every = load_arrays(subject / "gt" / "poses.npz")["camera_from_head"]
+    true, poses = every[found["frame_index"]], found["camera_from_head"]
     apart = rotations_apart(poses[:, :3, :3], true[:, :3, :3])
-    angle = np.degrees(np.linalg.norm(apart, axis=1))
+    rotations = rotation_errors(found, every)
     alignment, geometry = score_geometry(
         subject, load_mesh(tracked / "mesh.npz"), true, poses, np.random.default_rng(0)
     )
@@ -67,12 +67,12 @@ def errors_of(subject: Path, work: Path) -> dict[str, object]:
     return {
         "frames": len(poses),
         "excluded": len(record["excluded"]),
-        "rotation_mean_deg": angle.mean(),
-        "rotation_max_deg": angle.max(),
+        "rotation_mean_deg": rotations["rotation_mean_deg"],
+        "rotation_max_deg": rotations["rotation_max_deg"],
         "jitter_deg": np.degrees(np.linalg.norm(np.diff(apart, axis=0), axis=1)).mean(),
         "across_mm": np.linalg.norm(off[:, :2], axis=1).mean(),
         "depth_mm": np.abs(off[:, 2]).mean(),
-        "covered": rotation_coverage(apart, found["covariance"][:, :3, :3]),
+        "covered": rotations["covered"],
         "geometry_median_mm": geometry["geometry_mm"]["median"],
         "geometry_p95_mm": geometry["geometry_mm"]["p95"],
         "reprojection_px": record["reprojection_px"]["median"],

@@ -34,14 +34,13 @@ from shared.inverse.pose_rounds import FINE
 from shared.io.arrays import load_arrays, read_json, write_json
 from shared.io.meshes import load_mesh
 from shared.tracking.first_poses import UNTRACKED_SEGMENTS
-from shared.tracking.pose_uncertainty import rotations_apart
 from shared.tracking.texture_tracking import AtlasTracker
 from shared.tracking.texture_tracks import MeanContrast
 from tools.bench.chart.scores import relit_shots, render_shots
 from tools.bench.runner import plain, shown_value
 from tools.relight.inputs import open_asset
 from tools.scoring.align import Similarity
-from tools.scoring.measures import rotation_acceleration_deg, rotation_coverage
+from tools.scoring.rotations import final_poses, rotation_errors
 from tools.scoring.score import score
 from tools.scoring.shadows import shadow_edge_residual
 
@@ -89,32 +88,16 @@ def cost_row(run: Path) -> dict[str, object]:
 def pose_row(subject: Path, run: Path) -> dict[str, object]:
     """Errors of the final poses and of those of track_landmarks, and whether inverse_render tracked again."""
     true = load_arrays(subject / "gt" / "poses.npz")["camera_from_head"]
-    tracked, solved = (load_arrays(run / "work" / stage / "poses.npz") for stage in
-                       ("track_landmarks", "inverse_render"))  # fmt: skip
-    if "covariance" not in solved:
-        place = {frame: k for k, frame in enumerate(tracked["frame_index"].tolist())}
-        own = [place[frame] for frame in solved["frame_index"].tolist()]
-        solved = solved | {"covariance": tracked["covariance"][own]}
-    repeated = read_json(run / "work" / "inverse_render" / "solve.json").get("poses") or {}
+    tracked, solved = run / "work" / "track_landmarks", run / "work" / "inverse_render"
+    final = final_poses(tracked, solved)
+    repeated = read_json(solved / "solve.json").get("poses") or {}
+    before = rotation_errors(load_arrays(tracked / "poses.npz"), true)
     return {
-        "frames": len(solved["frame_index"]),
-        **pose_errors(solved, true),
-        **{f"tracked_{name}": value for name, value in pose_errors(tracked, true).items()},
+        "frames": len(final["frame_index"]),
+        **rotation_errors(final, true),
+        **{f"tracked_{name}": value for name, value in before.items()},
         "pose_rounds": len(repeated.get("rounds_deg", ())),
         "poses_kept": bool(repeated.get("kept", False)),
-    }
-
-
-def pose_errors(found: dict[str, np.ndarray], true: np.ndarray) -> dict[str, float]:
-    """found: what poses.npz holds; true [N, 4, 4]: the pose of every frame of the clip."""
-    index = found["frame_index"]
-    apart = rotations_apart(found["camera_from_head"][:, :3, :3], true[index, :3, :3])
-    angle = np.degrees(np.linalg.norm(apart, axis=1))
-    return {
-        "rotation_mean_deg": float(angle.mean()),
-        "rotation_max_deg": float(angle.max()),
-        "covered": rotation_coverage(apart, found["covariance"][:, :3, :3]),
-        "acceleration_deg": rotation_acceleration_deg(apart, index),
     }
 
 

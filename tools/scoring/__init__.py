@@ -1,5 +1,5 @@
 """Scores of a result against a subject's truth.
 
-Read in this order: align, buffers, measures, table, score, shadows, appearance_errors.
+Read in this order: align, buffers, measures, rotations, table, score, shadows, appearance_errors.
 May import: shared.
 """

@@ -22,7 +22,7 @@ from tools.bench.stress.verdict import (
     is_wrong,
 )
 
-_SHOWN = (*LIMITS, *CONFIDENT.values(), "confident_share", "specular_bias", "roughness_bias", "log_scale")
+_SHOWN = (*LIMITS, *CONFIDENT.values(), "confident_share", "covered", "specular_bias", "roughness_bias", "log_scale")
 _PANELS, _WIDTH, _HEIGHT, _LEFT, _TOP = 5, 220, 168, 38, 26
 _PLOT = (170, 88)
 _RANGE = 8.0
@@ -57,7 +57,9 @@ def page(rows: Sequence[dict], missing: Sequence[str], code: str) -> str:
         "![Scores over severity](stress.svg)", "",
         "**Wrong**: a score is worse than its limit and than its growth times the score at 0. **Said**: a stage "
         "refuses the clip (exit code 2), or a quality gate is missed that 0 keeps, or a warning that 0 does not give "
-        "names the matter, or all that is wrong is the albedo and it is right where the confidence is above 0.5.", "",
+        "names the matter, or all that is wrong is the albedo and it is right where the confidence is above 0.5. "
+        "**Covered**: share of frames whose rotation lies within the 90 % region of its reported covariance; it is "
+        "shown and not judged.", "",
         "| score | what | limit | growth | at 0 |", "|---|---|---|---|---|",
         *(f"| {name} | {limit.what} | {limit.most:g} {limit.unit} | {limit.growth:g} | {_number(zero.get(name))} |"
           for name, limit in LIMITS.items()), "",
@@ -65,8 +67,8 @@ def page(rows: Sequence[dict], missing: Sequence[str], code: str) -> str:
         "wrong. Gates that the case at 0 misses, which do not count: "
         f"{'; '.join(rows[0]['missed_gates']) or 'none'}.",
         "",
-        "| perturbation | severity | " + " | ".join(LIMITS) + " | verdict | what Limn said |",
-        "|---|---|" + "---|" * len(LIMITS) + "---|---|",
+        "| perturbation | severity | " + " | ".join(LIMITS) + " | covered | verdict | what Limn said |",
+        "|---|---|" + "---|" * len(LIMITS) + "---|---|---|",
         *(_line(row, zero, row["code"] != code) for row in rows if row["severity"]),
     ]
     if any(row["code"] != code for row in rows):
@@ -83,6 +85,7 @@ def _line(row: dict, zero: dict, old: bool) -> str:
         value = scores.get(name)
         wrong = name in scores and is_wrong(name, value, zero[name])
         cells.append(f"**{_number(value)}**" if wrong else _number(value))
+    cells.append(_number(scores.get("covered")))
     said, mark = "; ".join(verdict.said) or "nothing", " \\*" if old else ""
     return (f"| {perturbation.what}{mark} | {row['severity']:g} {perturbation.unit} | " + " | ".join(cells)
             + f" | {verdict.word} | {said.replace('|', '/')} |")

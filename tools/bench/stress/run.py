@@ -20,11 +20,13 @@ from shared.contract.folders import RunFolder
 from shared.contract.manifest import read_record
 from shared.contract.pipeline import Pipeline
 from shared.inverse.clip_inputs import read_inputs
+from shared.io.arrays import load_arrays
 from shared.io.images import read_exr
 from shared.io.meshes import load_mesh, write_obj
 from tools.cli.gates import Flag
 from tools.cli.measures import MEASURES
 from tools.scoring.appearance_errors import map_errors
+from tools.scoring.rotations import final_poses, rotation_errors
 from tools.scoring.score import score
 
 SETTINGS = {
@@ -103,6 +105,7 @@ def scores_of(subject: Path, run: RunFolder) -> dict[str, float]:
     inputs = read_inputs(run.published("sample_frames"), run.published("track_landmarks"))
     maps = {path.stem: read_exr(path) for path in (export / "maps").glob("*.exr")}
     mesh = load_mesh(run.published("inverse_render") / "mesh.npz")
+    poses = final_poses(run.published("track_landmarks"), run.published("inverse_render"))
     errors = map_errors(subject, inputs, inputs.frame_index, mesh, maps)
     return {
         "albedo": errors["delta_e2000_median"],
@@ -116,5 +119,6 @@ def scores_of(subject: Path, run: RunFolder) -> dict[str, float]:
         "light": found["envmap"]["lobe25_front_rel_rmse"],
         "specular_bias": found["specular"]["mean_result"] - found["specular"]["mean_gt"],
         "roughness_bias": found["roughness"]["mean_result"] - found["roughness"]["mean_gt"],
+        "covered": rotation_errors(poses, load_arrays(subject / "gt" / "poses.npz")["camera_from_head"])["covered"],
         "log_scale": float(-np.log(np.mean(found["albedo"]["gain"]))),
     }
