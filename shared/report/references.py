@@ -113,6 +113,9 @@ REFERENCES = {
         "Wald et al., Embree: A Kernel Framework for Efficient CPU Ray Tracing. ACM Transactions on Graphics 33, "
         "2014.",
     "Walter2007": "Walter et al., Microfacet Models for Refraction through Rough Surfaces. EGSR 2007.",
+    "Wang2004":
+        "Wang et al., Image Quality Assessment: From Error Visibility to Structural Similarity. IEEE Transactions on "
+        "Image Processing 13, 2004.",
     "Wang2009": "Wang et al., All-Frequency Rendering of Dynamic, Spatially-Varying Reflectance. SIGGRAPH Asia 2009.",
     "Xu2025": "Xu et al., Monocular Facial Appearance Capture in the Wild. ICCV 2025.",
 }

@@ -1,5 +1,5 @@
 """Scores of a result against a subject's truth.
 
-Read in this order: align, buffers, measures, rotations, table, score, shadows, appearance_errors.
+Read in this order: align, buffers, measures, rotations, table, score, shadows, appearance_errors, held_out.
 May import: shared.
 """
