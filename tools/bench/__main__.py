@@ -17,6 +17,7 @@ BENCHES = {
     "tracking": "tracking:TrackingBench",
     "backwards": "tracking:BackwardsBench",
     "hard_light": "hard_light:HardLightBench",
+    "real": "real:RealBench",
     "colour_chart": "colour_chart:ColourChartBench",
     "shading": "shading:ShadingBench",
     "profile": "profile:ProfileBench",

@@ -22,16 +22,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from shared.contract.declare import folder_of
-from shared.contract.manifest import PROVENANCE
 from shared.contract.pipeline import load_pipeline
 from shared.contract.subject import load_subject
 from shared.errors import InputError
 from shared.io.arrays import read_json
-from tools.bench.chart.runs import SHOWN, current_code, fingerprints
+from tools.bench.chart.runs import current_code
 from tools.bench.chart.scores import CODE
 from tools.bench.runner import Bench, Entry, Table, measured
-from tools.bench.whole_run import COLUMNS, row_of
+from tools.bench.whole_run import COLUMNS, code_of, row_of
 from tools.synthesis.subject import SynthesisSettings, parse
 
 FRAMES = 100
@@ -170,7 +168,7 @@ class HardLightBench(Bench):
         command = [sys.executable, "-m", "tools.limn", "run", str(subject), "--out", str(run.parent), "--renew"]
         measured(command, run.with_name(f"{run.name}.log"), well=(0, NEEDS_A_LOOK))
         row = {"scan": _head(case), **row_of(subject, run)}
-        entry.table.beside["code"][entry.name] = _code_of(run)
+        entry.table.beside["code"][entry.name] = code_of(run, SCORED_BY)
         entry.add(row)
 
     def subject_of(self, name: str, case: HardLightCase) -> Path:
@@ -192,12 +190,3 @@ class HardLightBench(Bench):
 def _head(case: HardLightCase) -> str:
     """The scan's name, nothing for a random head."""
     return case.scan.name if case.scan else ""
-
-
-def _code_of(run: Path) -> dict[str, str]:
-    """{file of the repository: fingerprint} of what made the run and its row."""
-    made: dict[str, str] = {}
-    for stage in load_pipeline(None).stages:
-        code = read_json(run / folder_of(stage) / PROVENANCE)["code"]
-        made |= {file: digest[:SHOWN] for file, digest in code.items()}
-    return dict(sorted((made | fingerprints(SCORED_BY)).items()))

@@ -19,6 +19,7 @@ import argparse
 import os
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,7 @@ from shared.io.meshes import load_mesh
 from shared.tracking.first_poses import UNTRACKED_SEGMENTS
 from shared.tracking.texture_tracking import AtlasTracker
 from shared.tracking.texture_tracks import MeanContrast
+from tools.bench.chart.runs import SHOWN, fingerprints
 from tools.bench.chart.scores import relit_shots, render_shots
 from tools.bench.runner import plain, shown_value
 from tools.relight.inputs import open_asset
@@ -83,6 +85,16 @@ def cost_row(run: Path) -> dict[str, object]:
         "peak_mb": max(record["peak_memory_mb"] for record in every),
         "warnings": "; ".join(dict.fromkeys(text for record in every for text in record["warnings"])),
     }
+
+
+def code_of(run: Path, scored_by: Sequence[str]) -> dict[str, str]:
+    """{file of the repository: fingerprint} of what made the run, and of scored_by as they are now, which made its row.
+    """
+    made: dict[str, str] = {}
+    for stage in load_pipeline(None).stages:
+        code = read_json(run / folder_of(stage) / PROVENANCE)["code"]
+        made |= {file: digest[:SHOWN] for file, digest in code.items()}
+    return dict(sorted((made | fingerprints(scored_by)).items()))
 
 
 def pose_row(subject: Path, run: Path) -> dict[str, object]:
