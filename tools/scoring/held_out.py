@@ -45,7 +45,7 @@ def region_errors(frames: Iterable[HeldOutFrame]) -> dict[str, dict[str, float]]
         for name, region in item.regions.items():
             sums[name] = sums.get(name, 0.0) + kinds[:, region].sum(1)
     return {
-        name: {"db": decibel(linear / count), "srgb_db": decibel(codes / count), "ssim": likeness / count,
+        name: {"db": decibel(linear / count), "srgb_db": decibel(codes / count), "ssim": float(likeness / count),
                "pixels": int(count)}
         for name, (linear, codes, likeness, count) in sums.items() if count
     }  # fmt: skip
