@@ -227,7 +227,7 @@ def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
         own["warnings"].append(text)
         warnings.append((STAGE.name, text))
     records[STAGE.name] = own
-    kept = ("model", "residuals", "albedo_scale", "held_out_frames", "clips")
+    kept = ("model", "residuals", "lamp", "albedo_scale", "held_out_frames", "clips")
     chosen = {key: solve[key] for key in kept if key in solve}
     if selection := selection_record(job.input("inverse_render"), solve):
         chosen["model_selection"] = selection

@@ -10,7 +10,9 @@ Method   What no track reaches (ears, skull, jaw) moves until the mesh's outline
          albedo. Under that light the mesh is refined from parallax and shading by
          Gauss-Newton, coarse to fine, the light solved anew, and the refined mesh kept if held-out frames fit better.
          On it all frames are tracked again; where that turns the poses by what matters, mesh and light follow from the
-         new ones. Light is summed along directions that lie close where a small lamp passes.
+         new ones. Light is summed along directions that lie close where a small lamp passes. Where there is one, it
+         stands at the distance that held-out frames ask for, far away if they ask for none
+         (shared/inverse/lamp_distance.py).
          Or (model=auto) the model is chosen first, on few points and frames: shared/selection/candidates.py. Then
          albedo and specular intensity per texel in closed form, streaming over the frames; samples where a cast shadow
          ends, which the mesh tells to millimetres only, count less. The solver starts from a uniform light and the
@@ -72,6 +74,8 @@ STAGE = Stage(
         Output("maps/*.exr", "albedo, specular intensity, roughness, normal, confidence", space="uv",
                colour_space="in each file"),
         Output("envmap.exr", "incident radiance, lat-long", space="world", colour_space="lin_rec709_scene"),
+        Output("envmap_far.exr", "the same without the main lamp, where that stands near", space="world",
+               colour_space="lin_rec709_scene", optional=True),
         Output("mesh.npz", "the refined mesh, with its face segments", unit="mm", space="head", fields=MESH),
         Output("shape.png", "tracked and refined mesh, normals and difference, from three sides", colour_space="srgb"),
         Output("poses.npz", "the head's pose in each frame, and the lens", unit="mm", fields=SOLVED_POSES),
@@ -96,6 +100,8 @@ STAGE = Stage(
                   "only as far as held-out frames fit better for it.", choices=MODELS),
         Parameter("fixed_parts", str, "", "Parts of the model that model=auto leaves as the other parameters say, "
                   "separated by commas: visibility, specular, light, geometry, roughness.", former="forced"),
+        Parameter("lamp_distance", str, "auto", "How far the light's main lamp stands from the head: auto, as near as "
+                  "held-out frames ask for, far, or so many mm."),
         Parameter("points", int, 4000, "Surface points that the light is solved from.", "", 200, 40000),
         Parameter("coarse_points", int, 1000, "As many of them on which the light comes to rest, before a last step on "
                   "all; 0: all from the first step on.", "", 0, 40000),
@@ -167,6 +173,25 @@ def write_maps(job: Job, result) -> None:
         write_exr(job.out / "maps" / f"{name}.exr", image, colour_space=colour_space, attributes=attributes)
 
 
+def write_light(folder: Path, light, result) -> None:
+    """envmap.exr of a light [6 n^2, 3], as the head's mean place sees it; where a lamp stands near, envmap_far.exr is
+    the same without it."""
+    from shared.geometry.transforms import places_in_world
+    from shared.io.images import write_exr
+    from shared.rendering.envmap import latlong_from_cube
+    from shared.rendering.near_lamp import latlong_at, without_lamp
+
+    lamp = result.solution.lamp
+    if lamp is None:
+        images = {"envmap": latlong_from_cube(light, LATLONG_HEIGHT)}
+    else:
+        place = places_in_world(result.views.camera_from_head, result.views.moves).mean(0)
+        images = {"envmap": latlong_at(light, lamp, place, LATLONG_HEIGHT),
+                  "envmap_far": latlong_from_cube(without_lamp(light, lamp), LATLONG_HEIGHT)}
+    for name, image in images.items():
+        write_exr(folder / f"{name}.exr", image, colour_space="lin_rec709_scene", latlong=True)
+
+
 def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
     """envmap.exr, poses.npz and renders/%06d.exr of a clip -> which frames of its source were re-rendered, which held
     out.
@@ -176,12 +201,10 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
     from shared.imaging.frame_index import spread_frames
     from shared.io.arrays import save_arrays
     from shared.io.images import write_exr
-    from shared.rendering.envmap import latlong_from_cube
     from shared.rendering.render import SurfaceMaps, render_frame
 
     (folder / "renders").mkdir(parents=True)
-    latlong = latlong_from_cube(light, LATLONG_HEIGHT)
-    write_exr(folder / "envmap.exr", latlong, colour_space="lin_rec709_scene", latlong=True)
+    write_light(folder, light, result)
     frames, index = clip.frames, clip.frame_index
     poses = result.views.camera_from_head[first : first + len(index)]
     covariance = {} if result.covariance is None else {"covariance": result.covariance}
@@ -208,7 +231,7 @@ def read_clips(job: Job) -> tuple:
 
     params = job.params
     given = {"mesh": bool(params.mesh), "poses": bool(params.poses), "fit_frames": params.fit_frames > 0,
-             "solver": params.solver == "reference"}
+             "solver": params.solver == "reference", "lamp_distance": params.lamp_distance not in ("auto", "far")}
     for name in (name for name, is_given in given.items() if is_given and job.clips):
         raise InputError("works on one clip only", where=f"--set inverse_render.{name}", got=f"{len(job.clips)} clips",
                          hint="leave it out, or make a subject of one clip")

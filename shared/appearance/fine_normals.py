@@ -173,8 +173,12 @@ class NormalPass:
         shading = self.shading
         for k, f in enumerate(shown):
             if k % _TOGETHER == 0:
-                light = shading.light_along[:, frames[k : k + _TOGETHER]].reshape(len(shading.directions), -1)
+                together = frames[k : k + _TOGETHER]
+                light = shading.far_along[:, together].reshape(len(shading.directions), -1)
                 vectors = irradiance_vectors(shading.transfer, light, shading.directions)
+                near = shading.lamp_vectors(np.arange(len(vectors)), together)
+                if np.ndim(near):
+                    vectors += near.transpose(0, 3, 1, 2).reshape(vectors.shape)
             first = 3 * (k % _TOGETHER)
             yield f, vectors[..., first : first + 3].transpose(0, 2, 1)
 

@@ -16,6 +16,7 @@ from shared.appearance.observations import Capture
 from shared.appearance.problem import AppearanceProblem, AppearanceSettings, AppearanceState
 from shared.appearance.projection import LARGEST_ROUGHNESS_STEP, changed_roughness
 from shared.appearance.sample_errors import SampleErrors
+from shared.rendering.near_lamp import NearLamp
 
 _SHAPING_STEPS, _SHAPED = 3, 0.1
 """Without highlights at least as many steps from a uniform light, until one changes the fitted residual by less than
@@ -106,7 +107,7 @@ class Solution:
     held-out frames said to that; highlights_count: whether highlights took part to the end; frame_errors [F]: each
     frame's mean absolute residual; local_specular: where the specular intensity varies with the face's segments, how;
     light_weights: of several lights, how much samples of each count against those of the light that the model follows
-    best."""
+    best; lamp: of the light, where it stands near."""
 
     state: AppearanceState
     iterations: tuple[dict, ...]
@@ -118,6 +119,7 @@ class Solution:
     frame_errors: np.ndarray | None = None
     local_specular: SpecularEquations | None = None
     light_weights: tuple[float, ...] = ()
+    lamp: NearLamp | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,6 +197,7 @@ def fit_appearance(
     return Solution(
         appearance, tuple(records), fitted=found.fitted, held_out=found.held_out, highlights_count=highlights_count,
         frame_errors=found.frame_errors, light_weights=found.light_weights,
+        lamp=None if capture.lamp is None else capture.lamp.lamp,
     )
 
 

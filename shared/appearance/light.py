@@ -30,7 +30,8 @@ class FrameLight:
     """A cubemap light of a resolution, seen along directions [J, 3] of head space in F frames.
 
     world_from_head [F, 3, 3] turns head-space directions into the space in which the light stands still; light_index
-    [F]: which of several lights, one below the other, each frame stands in; None: there is one.
+    [F]: which of several lights, one below the other, each frame stands in; None: there is one. near [n]: texels that
+    reach the head in another way and do not count here, see shared.rendering.near_lamp.
     """
 
     def __init__(
@@ -39,9 +40,14 @@ class FrameLight:
         directions: np.ndarray,
         world_from_head: np.ndarray,
         light_index: np.ndarray | None = None,
+        near: np.ndarray | None = None,
     ):
         self.resolution, self.shape = resolution, (len(directions), len(world_from_head))
         self._lookup = frame_lookup(directions, world_from_head, resolution, light_index).astype(np.float32)
+        if near is not None:
+            far = np.ones(self._lookup.shape[1], np.float32)
+            far[near] = 0.0
+            self._lookup = (self._lookup @ sparse.diags(far)).tocsr()
         self._transposed = self._lookup.T.tocsr()
 
     def of_frame(self, frame: int) -> sparse.csr_matrix:

@@ -13,6 +13,7 @@ from shared.geometry.transforms import camera_centres, world_from_head
 from shared.imaging.frame_index import frames_of_lights, spread_frames
 from shared.imaging.image_sampling import Samples, SurfaceViewer, sample_points_in_frames
 from shared.imaging.views import Views
+from shared.rendering.near_lamp import SeenLamp
 from shared.rendering.precomputed_transfer import PrecomputedTransfer
 from shared.rendering.shading import DEEP
 from shared.rendering.transfer import Nodes, Points, Transfer, mesh_points, spread_vertices
@@ -27,7 +28,7 @@ class Capture:
     points [P] with samples [P, F] and transfer; nodes and their own transfer; directions [J, 3];
     world_from_head [F, 3, 3]; fitted [F] bool (the other frames are held out); skin [P] bool: where the prior on skin
     reflectance applies; light_index [F]: which light each frame stands in; chart: what a colour chart says about the
-    light's scale.
+    light's scale; lamp: of the light, where it stands near, None: all of the light is far away.
     """
 
     points: Points
@@ -41,6 +42,7 @@ class Capture:
     skin: np.ndarray
     light_index: np.ndarray
     chart: ChartStatement | None = None
+    lamp: SeenLamp | None = None
 
     @property
     def frames_of_lights(self) -> list[np.ndarray]:

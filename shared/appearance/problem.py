@@ -30,9 +30,10 @@ from shared.appearance.light_models import LightModel, make_light_model
 from shared.appearance.observations import Capture
 from shared.appearance.sample_errors import SampleErrors
 from shared.appearance.skin_prior import SkinPrior, SkinVariation
-from shared.appearance.transport import Lobes, Transport
+from shared.appearance.transport import LampTransfer, Lobes, Transport
 from shared.compute.threads import share_out
 from shared.rendering.lobes import SpecularTransfer
+from shared.rendering.near_lamp import LampView
 from shared.rendering.shading import Material
 from shared.rendering.transfer import Transfer, nearest_points
 
@@ -102,6 +103,11 @@ class AppearanceState:
         return albedo * irradiance + self.specular * reflection
 
 
+def _sent_on(state: AppearanceState) -> np.ndarray:
+    """[K, 3]: the share of the light that nodes send on."""
+    return Material(state.node_albedo, state.specular, state.roughness).bounce_albedo()
+
+
 class _Latest:
     """A function whose last value is kept: made anew only for another argument, the old value let go first, since a
     table of lobes is the greatest thing in memory."""
@@ -134,12 +140,14 @@ class Bounces:
         """Those to some of the points."""
         return replace(self, to_points=self.to_points[index])
 
-    def with_direct(self, direct: np.ndarray, albedo: np.ndarray) -> np.ndarray:
+    def with_direct(self, direct: np.ndarray, albedo: np.ndarray, to_nodes: np.ndarray | None = None) -> np.ndarray:
         """[3, P, J]: irradiance from each direction, direct [P, J] and by all diffuse bounces between nodes of an
-        albedo [K, 3]: node_radiosity of all directions, channels and blocks of points shared out."""
+        albedo [K, 3]: node_radiosity of all directions, channels and blocks of points shared out. to_nodes [K, J]: from
+        other sources than the directions, which direct is of, too."""
+        to_nodes = self.to_nodes if to_nodes is None else to_nodes
         among, identity = self.among_nodes, np.eye(len(self.among_nodes), dtype=np.float32)
         own = albedo.T.astype(np.float32)[..., None]
-        radiosity = share_out(3, lambda c: np.linalg.solve(identity - own[c] * among, own[c] * self.to_nodes))
+        radiosity = share_out(3, lambda c: np.linalg.solve(identity - own[c] * among, own[c] * to_nodes))
         total = np.empty((3, *direct.shape), np.float32)
         blocks = [(c, slice(first, first + _POINTS_PER_BLOCK))
                   for c in range(3) for first in range(0, len(direct), _POINTS_PER_BLOCK)]
@@ -168,6 +176,7 @@ class AppearanceProblem:
     bounces: Bounces
     _latest_lobes: _Latest = field(default_factory=_Latest, repr=False)
     _latest_frame_light: _Latest = field(default_factory=_Latest, repr=False)
+    _latest_lamp: _Latest = field(default_factory=_Latest, repr=False)
 
     @classmethod
     def of(cls, capture: Capture, settings: AppearanceSettings) -> AppearanceProblem:
@@ -236,18 +245,37 @@ class AppearanceProblem:
     def transport(self, state: AppearanceState) -> Transport:
         """How light reaches the points in a state."""
         capture = self.capture
+        near = None if capture.lamp is None else capture.lamp.lamp.texels(state.light_model.resolution)
         frame_light = self._latest_frame_light(state.light_model.resolution, lambda resolution: FrameLight(
-            resolution, capture.directions, capture.world_from_head, capture.light_index))
+            resolution, capture.directions, capture.world_from_head, capture.light_index, near))
         lobes = self.lobes_at(state.roughness) if self.settings.specular else None
-        return Transport(frame_light, self.direct, self.total_transfer(state), lobes)
+        return Transport(frame_light, self.direct, self.total_transfer(state), lobes, self.lamp_transfer(state))
 
     def total_transfer(self, state: AppearanceState) -> torch.Tensor:
         """[3, P, J]: irradiance from each direction, with all diffuse bounces between surfaces of the state's albedo.
         """
         if not self.settings.bounce:
             return self.direct[None].expand(3, -1, -1)
-        share = Material(state.node_albedo, state.specular, state.roughness).bounce_albedo()
-        return torch.from_numpy(self.bounces.with_direct(self.direct.numpy(), share))
+        return torch.from_numpy(self.bounces.with_direct(self.direct.numpy(), _sent_on(state)))
+
+    def lamp_transfer(self, state: AppearanceState) -> LampTransfer | None:
+        """How a near lamp reaches the points in a state, with all diffuse bounces; None where none is near."""
+        if self.capture.lamp is None:
+            return None
+        points = self.capture.points
+        view, direct, to_nodes = self._latest_lamp(state.light_model.resolution, self._lamp_rows)
+        if not self.settings.bounce:
+            return LampTransfer(view, points, direct, np.broadcast_to(direct, (3, *direct.shape)))
+        total = self.bounces.with_direct(direct.reshape(len(direct), -1), _sent_on(state),
+                                         to_nodes.reshape(len(to_nodes), -1))
+        return LampTransfer(view, points, direct, total.reshape(3, *direct.shape))
+
+    def _lamp_rows(self, resolution: int) -> tuple[LampView, np.ndarray, np.ndarray]:
+        """What is seen of the lamp, and its rows of the points [P, F, n] and of the nodes [K, F, n]."""
+        capture = self.capture
+        view = LampView(capture.lamp, resolution, capture.directions)
+        nodes = view.irradiance_rows(capture.nodes.points, capture.node_transfer.visibility())
+        return view, view.irradiance_rows(capture.points, self.table.visible), nodes
 
     def lobes_at(self, roughness: float) -> Lobes:
         """The points' lobes at a roughness."""

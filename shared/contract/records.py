@@ -164,6 +164,26 @@ _MODEL = (
     Field("model.roughness_variation.held_out.one", "With one value."),
     Field("model.roughness_variation.held_out.local", "With local roughness."),
 )
+_LAMP = (
+    Field("lamp", "How far the light's main lamp stands; absent where no lamp is in the light, it was said to be "
+          "far, or there are several clips.", "", optional=True),
+    Field("lamp.near", "Whether it stands near; absent where its distance was given.", "bool", optional=True),
+    Field("lamp.distance_mm", "Its distance from the mean place of the head's origin; absent where it is far.",
+          unit="mm", optional=True),
+    Field("lamp.position_mm", "Where it stands in world space, whose origin is the camera, or the head where the "
+          "camera moves; absent where it is far.", shape="3", unit="mm", optional=True),
+    Field("lamp.radius_mm", "Of a ball that is about as large as the lamp is seen; absent where it is far.", unit="mm",
+          optional=True),
+    Field("lamp.radiance", "Of that ball, so that as much light arrives; absent where it is far.", shape="3",
+          optional=True),
+    Field("lamp.tried", "The distances that were tried; absent where it was given.", "", optional=True),
+    Field("lamp.tried[].distance_mm", "The distance from the face's mean place; null: far away.", "number or null",
+          unit="mm"),
+    Field("lamp.tried[].held_out", "Error on the held-out frames."),
+    Field("lamp.fall", "By how much the error of the held-out frames fell from far away to the best distance.",
+          optional=True),
+    Field("lamp.standard_error", "The standard error of that over the frames.", optional=True),
+)
 _SCALE = (
     Field("albedo_scale", "What fixed the scale between light and albedo.", ""),
     Field("albedo_scale.method", "In words.", "text"),
@@ -223,6 +243,7 @@ SOLVE = (
     Field("poses.rounds_deg", "How far the poses turned each time that the frames were tracked, rms.", shape="N",
           unit="deg", optional=True),
     Field("poses.turned_deg", "How far they turned in all, rms.", unit="deg", optional=True),
+    *_LAMP,
     Field("relief", "The normal map; empty with normal_map=false, absent with solver=reference.", "", optional=True),
     Field("relief.prior_radians", "Expected size of the turns.", unit="rad", optional=True),
     Field("relief.confirmed_share", "Share of the turns that held-out frames confirm.", optional=True),
@@ -287,6 +308,7 @@ RUN = (
     *_under("stages.<stage>", _STAGE_RECORD),
     *_MODEL,
     Field("residuals.**", "As in solve.json.", ""),
+    *_LAMP,
     *_SCALE,
     Field("held_out_frames", "Frames of the (first) clip that were not fitted.", "int", "H"),
     *_CLIPS,

@@ -91,6 +91,14 @@ def world_from_head(camera_from_head: np.ndarray, moves: str) -> np.ndarray:
     return WORLD_FROM_CAMERA @ camera_from_head[..., :3, :3]
 
 
+def places_in_world(camera_from_head: np.ndarray, moves: str) -> np.ndarray:
+    """[..., 4, 4] -> [..., 3] mm: where the head's origin is in that space, whose own origin is the camera if the head
+    moves, and the head's if the camera does."""
+    if moves == "camera":
+        return np.zeros(camera_from_head.shape[:-2] + (3,))
+    return camera_from_head[..., :3, 3] @ WORLD_FROM_CAMERA
+
+
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     """The rotation [3, 3] closest to a matrix [3, 3] in the Frobenius norm [Kabsch1976]."""
     u, _, vt = np.linalg.svd(matrix)

@@ -17,6 +17,7 @@ from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.views import Views
 from shared.inverse.problem import FACE_SKIN, InverseSettings
 from shared.rendering.direction_set import concentrated, split_directions
+from shared.rendering.near_lamp import NearLamp, SeenLamp
 from shared.rendering.precomputed_transfer import PrecomputedTransfer, precompute_transfer
 from shared.rendering.shading import light_along
 from shared.shape.refine import subdivided_to
@@ -43,20 +44,31 @@ class LitSurface:
         context: RunContext,
         before: Mesh | None = None,
         directions: np.ndarray | None = None,
+        lamp: NearLamp | None = None,
     ) -> LitSurface:
         """Of a surface in some views; before: its mesh before refinement, by which its points are spread; directions
-        [J, 3] that its light is summed along, None: an even set."""
+        [J, 3] that its light is summed along, None: an even set; lamp: of its light, where it stands near."""
         layout = None if before is None else subdivided_to(before, surface.mesh).vertices
         viewer = SurfaceViewer.of(surface.mesh, layout)
         precomputed = precompute_transfer(viewer, settings.sizes, settings.appearance.visibility, directions)
         moves, skin = settings.appearance.light_moves(views.moves), surface.vertices_of(FACE_SKIN)
         capture = build_capture(viewer, precomputed, views, moves, skin, settings.sizes.points, context)
         capture = replace(capture, chart=chart)
-        return cls(surface, viewer, precomputed, capture, capture.some_points(settings.appearance.coarse_points))
+        found = cls(surface, viewer, precomputed, capture, capture.some_points(settings.appearance.coarse_points))
+        return found if lamp is None else found.with_lamp(lamp, views, moves)
+
+    def with_lamp(self, lamp: NearLamp, views: Views, moves: str) -> LitSurface:
+        """The same under a light whose lamp stands near; views: those that it was made of; moves: what moves against
+        the light."""
+        seen, whole = SeenLamp.of(lamp, views.camera_from_head, moves), self.coarse is self.capture
+        capture = replace(self.capture, lamp=seen)
+        return replace(self, capture=capture, coarse=capture if whole else replace(self.coarse, lamp=seen))
 
 
 def suited_directions(lit: LitSurface, solution: Solution) -> np.ndarray:
-    """[J, 3]: the directions that a surface was lit along, split where a lamp shines."""
+    """[J, 3]: the directions that a surface was lit along, split where a lamp shines; by a near one they are."""
+    if solution.lamp is not None:
+        return lit.precomputed.directions
     capture, even = lit.coarse, lit.precomputed.directions
     along = light_along(solution.state.light, even, capture.world_from_head, capture.light_index)
     return split_directions(even, concentrated(along))

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from shared.appearance.light import LightPriors
 from shared.appearance.problem import AppearanceSettings
 from shared.appearance.skin_prior import SkinVariation
 from shared.contract.job import Parameters
 from shared.contract.wording import unknown_name
 from shared.errors import InputError
+from shared.inverse.lamp_distance import NEAREST_MM
 from shared.inverse.problem import InverseSettings
 from shared.published.settings import ReferenceSettings, Weights
 from shared.published.shading import Sampling
+from shared.rendering.near_lamp import FAR
 from shared.rendering.precomputed_transfer import Sizes
 from shared.selection.candidates import PARTS
 from shared.shape.gauss_newton import ShapeSettings
 
+LAMP_DISTANCES = {"auto": None, "far": FAR}
 SPECULAR_SPREAD = 0.25
 """Standard deviation of the logarithm of people's mean specular intensity about the expected one."""
 
@@ -62,9 +67,24 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         fit_frames=params.fit_frames,
         normal_map=params.normal_map,
         pose_rounds=params.pose_rounds,
+        lamp_distance=read_lamp_distance(params.lamp_distance),
         reference=read_reference(params, checkpoint) if params.solver == "reference" else None,
         selection=read_forced(params.fixed_parts) if params.model == "auto" else None,
     )
+
+
+def read_lamp_distance(text: str) -> float | None:
+    """mm, or FAR; None: to be solved. InputError for anything else."""
+    if text in LAMP_DISTANCES:
+        return LAMP_DISTANCES[text]
+    try:
+        distance = float(text)
+    except ValueError:
+        distance = 0.0
+    if not NEAREST_MM <= distance < np.inf:
+        raise InputError("no distance of a lamp", where="--set inverse_render.lamp_distance", got=text,
+                         expected=f"{', '.join(LAMP_DISTANCES)} or {NEAREST_MM:g} mm or more")
+    return distance
 
 
 def read_forced(text: str) -> frozenset[str]:

@@ -35,7 +35,8 @@ class InverseSettings:
     face, 0: all but those held out; reference: solve by the published algorithm instead; selection: choose the model,
     up to what the settings say, and leave only the named parts of it as they say; specular_widths: over which, relative
     to the map, texels share their specular intensity: what held-out frames choose from; pose_rounds: how often, at
-    most, the frames are tracked again on the refined mesh."""
+    most, the frames are tracked again on the refined mesh; lamp_distance: of the light's main lamp, mm, FAR or, None,
+    where held-out frames have it."""
 
     sizes: Sizes = field(default_factory=Sizes)
     appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
@@ -49,6 +50,7 @@ class InverseSettings:
     selection: frozenset[str] | None = None
     specular_widths: tuple[float, ...] = (np.inf, 1 / 16, 1 / 64)
     pose_rounds: int = 3
+    lamp_distance: float | None = None
 
 
 @dataclass(frozen=True)
@@ -113,4 +115,6 @@ def shade_vertices(
         appearance.light_moves(views.moves),
         bounce=appearance.bounce,
         light_index=views.light_index,
+        lamp=solution.lamp,
+        node_points=precomputed.nodes.points,
     )

@@ -119,6 +119,6 @@ def refine_and_light(
         context=context,
     )
     light_views = some_views(views, settings, settings.light_frames)
-    lit = LitSurface.of(refined.surface, light_views, settings, chart, context, surface.mesh, directions)
+    lit = LitSurface.of(refined.surface, light_views, settings, chart, context, surface.mesh, directions, solution.lamp)
     then = fit_appearance(lit.coarse, settings.appearance, report_to(context), start=solution)
     return RefinedMesh(lit, then, refined.stopped)

@@ -25,6 +25,7 @@ from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import TexelSurface
 from shared.imaging.views import Views
 from shared.inverse.clip_inputs import TrackedPoses
+from shared.inverse.lamp_distance import describe_lamp, find_lamp
 from shared.inverse.lit_surface import LitSurface, report_to
 from shared.inverse.model_selection import SelectedModel, select
 from shared.inverse.problem import (
@@ -82,6 +83,10 @@ def solve_clip(
     solution = fit_appearance(lit.coarse, settings.appearance, report_to(context), start=selected.start,
                               keep_start=keeps_start)
 
+    # A lamp that stands near, where held-out frames ask for one.
+    by_lamp = find_lamp(lit, solution, light_views, settings, chart, context)
+    lit, solution = by_lamp.lit, by_lamp.solution
+
     # Then closer directions where a lamp shines, the mesh refined under that light, and the poses anew on that mesh.
     shaped = shape_and_turn(views, lit, solution, settings, chart, tracked, context)
     views, lit, solution = shaped.views, shaped.lit, shaped.solution
@@ -117,6 +122,8 @@ def solve_clip(
         "texture": texture_record,
         "shape": {**shape_record, "outline": outline},
         "poses": pose_record,
+        "lamp": describe_lamp(solution.lamp, solution.state.light, by_lamp.record, views,
+                              settings.appearance.light_moves(views.moves)),
         "relief": relief,
         "diagnostics": diagnostics,
         "warnings": [*filter(None, [chart_warning]), *scale_warnings(chart, typical),
@@ -192,6 +199,7 @@ def summarise(result: InverseResult, moves: str) -> dict:
             "texture_held_out": result.record["texture"]["held_out"],
         },
         **{key: result.record[key] for key in ("shape", "poses", "relief", "diagnostics") if key in result.record},
+        **({"lamp": lamp} if (lamp := result.record.get("lamp")) else {}),
         **({"model_selection": [dict(candidate) for candidate in tried]} if tried else {}),
         "iterations": list(solution.iterations),
         "albedo_scale": result.record["albedo_scale"],

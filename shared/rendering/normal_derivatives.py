@@ -19,7 +19,6 @@ from scipy.spatial import cKDTree
 
 from shared.compute.threads import share_out
 from shared.geometry.mesh import normalised, tangent_frames
-from shared.rendering.lobes import specular_reflection
 from shared.rendering.shading import VertexShading
 from shared.rendering.transfer import Points, Transfer, position_and_normal, spread_vertices
 
@@ -102,10 +101,8 @@ class Reflections:
         shading = self.shading
         towards, blocked = shading.towards_camera(frame)[self.anchors], shading.blocked_light(frame)[self.anchors]
         facing = np.nonzero((towards * self.normals).sum(1) > -0.1)[0]
-        light = shading.light_along[:, frame]
-        roughness = shading.roughness_of(self.anchors[facing])
         values = [
-            specular_reflection(table.take(facing), towards[facing], roughness, light, blocked[facing])
+            shading.reflection_by(table.take(facing), self.anchors[facing], towards[facing], frame, blocked[facing])
             for table in self.tables
         ]
         value, slope = np.zeros((len(self.anchors), 3)), np.zeros((len(self.anchors), 3, 3))
@@ -121,8 +118,9 @@ def shading_terms(shading: VertexShading, rows: np.ndarray, reflections: Reflect
     """
     normals = shading.points.normals[rows]
     tangents = tangent_frames(normals).astype(np.float32)
-    along = irradiance_vectors(shading.transfer, rows, shading.directions, shading.light_along)
-    shape = (len(rows), shading.light_along.shape[1], 3)
+    along = irradiance_vectors(shading.transfer, rows, shading.directions, shading.far_along)
+    along += shading.lamp_vectors(rows)
+    shape = (len(rows), shading.far_along.shape[1], 3)
     turn = (along.reshape(len(rows), -1, 3) @ tangents.transpose(0, 2, 1)).reshape(shape + (2,))
     shadow = shadow_slope(shading.points.take(rows), along)
     reflection, reflection_turn = np.zeros(shape, np.float32), np.zeros(shape + (2,), np.float32)

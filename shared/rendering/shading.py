@@ -5,7 +5,8 @@ fitted head is accurate to some tenths of a millimetre at best: between its lips
 of the sky is covered, its own visibility says nothing, and would turn a closed mouth into a black slit.
 
 Irradiance (with bounces) of all frames is one product, kept as half floats (6 bytes per vertex and frame); lobe sums
-depend on the camera and are made for key frames, a few degrees of turn apart.
+depend on the camera and are made for key frames, a few degrees of turn apart. A lamp that stands near adds to both what
+each vertex sees of it.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from shared.rendering.brdf import hemispherical_albedo
 from shared.rendering.envmap import frame_lookup
 from shared.rendering.irradiance_errors import SHADOW_MM, irradiance_slope, shadow_uncertainty
 from shared.rendering.lobes import SpecularTransfer, specular_reflection
+from shared.rendering.near_lamp import LampView, NearLamp, SeenLamp, without_lamp
 from shared.rendering.transfer import Points, Transfer, bounced_irradiance, irradiance, node_radiosity
 
 KEY_STEP = 0.05
@@ -58,13 +60,15 @@ class Material:
 
 
 class VertexShading:
-    """E and S of V vertices under a cubemap light in F frames.
+    """E and S of V vertices under a cubemap light in F frames. light_along [J, F, 3]: the light along the directions as
+    the head's mean place sees it; far_along: without what stands near.
 
     index [P]: the vertices that are shaded, out of all, vertices [V, 3]; points, transfer [P]: theirs; node_transfer:
     the nodes'; light [6 n^2, 3]; directions [J, 3]; camera_from_head [F, 4, 4]; moves: "head" or "camera"; bounce:
     count light that bounced; key_step: largest turn between two frames whose reflections are computed, radians; deep:
     covered share from which on a vertex takes what the nearest one in the open has; light_index [F]: which of several
-    lights, one below the other, each frame stands in, frames of one light in a row; None: there is one.
+    lights, one below the other, each frame stands in, frames of one light in a row; None: there is one; lamp: of the
+    light, where it stands near, None: all of it is far away; node_points: where the nodes are, asked for with a lamp.
     """
 
     def __init__(
@@ -83,12 +87,14 @@ class VertexShading:
         key_step: float = KEY_STEP,
         deep: float = DEEP,
         light_index: np.ndarray | None = None,
+        lamp: NearLamp | None = None,
+        node_points: Points | None = None,
     ):
         self.material, self.directions = material, directions
         self._deep, self._key_step = deep, key_step
-        self._nodes = node_transfer if bounce else None
+        self._nodes, self._node_points = node_transfer if bounce else None, node_points
         self._place(index, vertices, points, transfer)
-        self._light(light, camera_from_head, moves, light_index)
+        self._light(light, camera_from_head, moves, light_index, lamp)
 
     def of_points(
         self, index: np.ndarray, vertices: np.ndarray, points: Points, transfer: Transfer, material: Material
@@ -114,8 +120,13 @@ class VertexShading:
         self.table = SpecularTransfer(points.normals, transfer.visibility(), self.directions)
         self.__dict__.pop("stand_in", None)
 
-    def _light(self, light, camera_from_head, moves, light_index) -> None:
-        self.light_along = light_along(light, self.directions, world_from_head(camera_from_head, moves), light_index)
+    def _light(self, light, camera_from_head, moves, light_index, lamp=None) -> None:
+        turns = world_from_head(camera_from_head, moves)
+        self.light_along = self.far_along = light_along(light, self.directions, turns, light_index)
+        self._lamp = None
+        if lamp is not None:
+            self._lamp = LampShine.of(light, SeenLamp.of(lamp, camera_from_head, moves), self.directions)
+            self.far_along = light_along(self._lamp.far, self.directions, turns, light_index)
         self._node_light = None if self._nodes is None else self._sent_by_nodes()
         self._centres = camera_centres(camera_from_head)
         self._turn = turned_so_far(camera_from_head)
@@ -126,7 +137,7 @@ class VertexShading:
 
     def _receive(self) -> None:
         shape = (len(self.points), *self.light_along.shape[1:])
-        lights = self.light_along.reshape(len(self.directions), -1)
+        lights = self.far_along.reshape(len(self.directions), -1)
         # A frame's values lie side by side, since frames are asked for one by one.
         self._irradiance, self._bounced = np.zeros((2, shape[1], shape[0], 3), np.float16).transpose(0, 2, 1, 3)
 
@@ -134,6 +145,8 @@ class VertexShading:
             rows = slice(block * _POINTS_PER_PRODUCT, (block + 1) * _POINTS_PER_PRODUCT)
             part = self.transfer.take(rows)
             total = irradiance(part, lights).reshape(-1, *shape[1:])
+            if self._lamp is not None:
+                total += self._lamp.irradiance(self.points.take(rows), self.table.visible[rows])
             if self._node_light is not None:
                 bounced = bounced_irradiance(part, self._node_light).reshape(total.shape)
                 self._bounced[rows] = bounced
@@ -147,8 +160,10 @@ class VertexShading:
 
     def _sent_by_nodes(self) -> np.ndarray:
         """[K, F * 3]: the nodes' radiosity over pi, with all diffuse bounces."""
-        flat = self.light_along.reshape(len(self.directions), -1)
+        flat = self.far_along.reshape(len(self.directions), -1)
         direct = irradiance(self._nodes, flat).reshape(-1, *self.light_along.shape[1:])
+        if self._lamp is not None:
+            direct += self._lamp.irradiance(self._node_points, self._nodes.visibility())
         return node_radiosity(self._nodes, self.material.bounce_albedo(), direct).reshape(len(direct), -1)
 
     @cached_property
@@ -224,15 +239,62 @@ class VertexShading:
         towards, blocked = self.towards_camera(frame), self.blocked_light(frame)
         facing = np.nonzero((towards * self.points.normals).sum(1) > -0.1)[0]
         value = np.zeros((len(self.points), 3), np.float16)
-        light = np.ascontiguousarray(self.light_along[:, frame])
 
         def reflect(k: int) -> None:
             rows = facing[k * _POINTS_PER_BLOCK : (k + 1) * _POINTS_PER_BLOCK]
-            roughness = self.roughness_of(rows)
-            value[rows] = specular_reflection(self.table.take(rows), towards[rows], roughness, light, blocked[rows])
+            value[rows] = self.reflection_by(self.table.take(rows), rows, towards[rows], frame, blocked[rows])
 
         share_out(-(-len(facing) // _POINTS_PER_BLOCK), reflect)
         return value
+
+    def reflection_by(
+        self, table: SpecularTransfer, rows: np.ndarray, towards: np.ndarray, frame: int, blocked_light: np.ndarray
+    ) -> np.ndarray:
+        """S [n, 3] float32 of some of the P points, rows [n] int, in a frame, with the normals of a table of theirs;
+        towards [n, 3] unit; blocked_light [n, 3]: see there."""
+        roughness = self.roughness_of(rows)
+        value = specular_reflection(table, towards, roughness, self.far_along[:, frame], blocked_light)
+        if self._lamp is not None:
+            points = Points(self.points.positions[rows], table.normals)
+            value += self._lamp.reflection(points, table.visible, towards, table.alpha2(roughness), frame)
+        return value
+
+    def lamp_vectors(self, rows: np.ndarray, frames: np.ndarray | slice = slice(None)) -> np.ndarray | float:
+        """[n, F, 3 channels, 3] float32 of some of the P points, rows [n] int, in some frames: W of the near lamp, with
+        n . W its direct irradiance over pi; 0 where no lamp is near."""
+        if self._lamp is None:
+            return 0.0
+        return self._lamp.vectors(self.points.take(rows), self.table.visible[rows], frames)
+
+
+@dataclass(frozen=True)
+class LampShine:
+    """A near lamp of a known light: what is seen of it, its sources' radiance [M, 3], and the light without it, far
+    [6 n^2, 3]."""
+
+    view: LampView
+    radiance: np.ndarray
+    far: np.ndarray
+
+    @classmethod
+    def of(cls, light: np.ndarray, seen: SeenLamp, directions: np.ndarray) -> LampShine:
+        """That of a cubemap light [6 n^2, 3], for points whose visibility is known along directions [J, 3]."""
+        view = LampView(seen, round((len(light) / 6) ** 0.5), directions)
+        return cls(view, view.radiance(light), without_lamp(light, seen.lamp))
+
+    def vectors(self, points: Points, visible: np.ndarray, frames: np.ndarray | slice) -> np.ndarray:
+        """[P, F, 3 channels, 3]: W of points in some frames; visible [P, J] bool."""
+        return self.view.take(frames).vectors(points, visible, self.radiance)
+
+    def irradiance(self, points: Points, visible: np.ndarray) -> np.ndarray:
+        """[P, F, 3] over pi, without bounces; visible [P, J] bool."""
+        return self.view.irradiance(points, visible, self.radiance)
+
+    def reflection(
+        self, points: Points, visible: np.ndarray, towards: np.ndarray, alpha2: np.ndarray, frame: int
+    ) -> np.ndarray:
+        """[P, 3] at specular intensity 1 in one frame; visible [P, J] bool, towards [P, 3] unit, alpha2 [P]."""
+        return self.view.reflection(points, visible, towards, alpha2, self.radiance, frame)
 
 
 def _stand_ins(vertices: np.ndarray, index: np.ndarray, blocked: np.ndarray, deep: float) -> np.ndarray:

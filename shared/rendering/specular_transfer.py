@@ -16,7 +16,7 @@ from shared.compute.compiled import compiled
 from shared.compute.threads import share_out
 from shared.rendering.lobes import SpecularTransfer, blocks_of, cover_lobe, weigh_directions
 
-_LOG_STEP = 0.05
+LOG_STEP = 0.05
 """Of log roughness, to either side of a derivative."""
 
 
@@ -40,7 +40,7 @@ def specular_tables(
 def specular_slopes(table: SpecularTransfer, towards: np.ndarray, roughness: float) -> tuple[torch.Tensor, np.ndarray]:
     """Derivatives of specular_tables by the logarithm of the roughness, as central differences; shapes as there.
     towards [P, F, 3] unit."""
-    ends = [roughness * float(np.exp(side * _LOG_STEP)) for side in (-1.0, 1.0)]
+    ends = [roughness * float(np.exp(side * LOG_STEP)) for side in (-1.0, 1.0)]
 
     def tabulate(view: np.ndarray, bits: np.ndarray, blocked: np.ndarray) -> None:
         narrower, wider = (table.alpha2(end) for end in ends)
@@ -48,7 +48,7 @@ def specular_slopes(table: SpecularTransfer, towards: np.ndarray, roughness: flo
 
     def split(part: slice, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         narrower, wider = (table.split_sum(part, view, end) for end in ends)
-        return tuple((w - n) / np.float32(2.0 * _LOG_STEP) for n, w in zip(narrower, wider, strict=True))
+        return tuple((w - n) / np.float32(2.0 * LOG_STEP) for n, w in zip(narrower, wider, strict=True))
 
     return _of_all_views(table, towards, tabulate if table.resolves(roughness) else None, split)
 
@@ -92,11 +92,11 @@ def _tabulate_lobes(normals, towards, alpha2, directions, visible, bits, blocked
 
 @compiled
 def _tabulate_slopes(normals, towards, alpha2_narrower, alpha2_wider, directions, visible, bits, blocked):
-    """Likewise of the difference of two lobes over twice _LOG_STEP."""
+    """Likewise of the difference of two lobes over twice LOG_STEP."""
     count = directions.shape[1]
     weights, others = np.empty(count, np.float32), np.empty(count, np.float32)
     words = weights.view(np.int32)
-    per_log = np.float32(0.5 / _LOG_STEP)
+    per_log = np.float32(0.5 / LOG_STEP)
     for p in range(len(normals)):
         weigh_directions(normals[p], towards[p], alpha2_wider[p], directions, weights)
         weigh_directions(normals[p], towards[p], alpha2_narrower[p], directions, others)

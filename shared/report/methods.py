@@ -161,6 +161,7 @@ def _solving(records: RunRecords) -> Iterable[str]:
                "published {Xu2025} {Nicolet2021} {Karis2013}.")
     else:
         yield from _transfer(parameters)
+        yield from _lamp(records.solve.get("lamp") or {})
     yield from _shape(parameters, records.solve.get("shape") or {})
     residuals, held_out = records.solve.get("residuals", {}), records.solve.get("held_out_frames", ())
     if isinstance(residuals.get("held_out"), float) and isinstance(residuals.get("fitted"), float):
@@ -188,6 +189,18 @@ def _transfer(parameters: Mapping[str, object]) -> Iterable[str]:
         yield "Albedo and specular intensity were then solved in closed form for each texel."
     elif parameters.get("specular") is False:
         yield "Albedo was then solved in closed form for each texel, without highlights."
+
+
+def _lamp(lamp: Mapping[str, object]) -> Iterable[str]:
+    tried = [f"{one['distance_mm'] / 1000:.2f} m" for one in lamp.get("tried", ()) if one["distance_mm"] is not None]
+    if "distance_mm" in lamp:
+        place = (f"{lamp['distance_mm'] / 1000:.2f} m from the head, with parallax and the inverse square of the "
+                 "distance")
+        yield (f"Its main lamp stands {place}: of far away and {_listed(tried)} it fits held-out frames best, by more "
+               "than the standard error {Breiman1984}." if tried else f"Its main lamp was said to stand {place}.")
+    elif tried:
+        yield (f"Its main lamp is far away: at {_listed(tried)} it fits held-out frames no better by more than the "
+               "standard error {Breiman1984}.")
 
 
 def _shape(parameters: Mapping[str, object], shape: Mapping[str, object]) -> Iterable[str]:

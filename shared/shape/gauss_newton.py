@@ -22,6 +22,7 @@ from shared.geometry.mesh import Mesh, subdivide, vertex_normals
 from shared.geometry.surface import TrackPoints
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.views import Views
+from shared.rendering.near_lamp import NearLamp
 from shared.rendering.normal_derivatives import Reflections, shading_terms
 from shared.rendering.precomputed_transfer import PrecomputedTransfer, Sizes, precompute_transfer
 from shared.rendering.shading import DEEP, Material, VertexShading
@@ -68,7 +69,8 @@ class ShapeSettings:
 class Reflectance:
     """What the shape is solved under: light [6 n^2, 3], specular intensity, roughness and how it varies; nodes with
     their albedo [K, 3]: where light bounced when it was solved; directions [J, 3] that suit the light; light_weights:
-    of several lights, which lie one below the other, how much samples of each count."""
+    of several lights, which lie one below the other, how much samples of each count; lamp: of the light, where it
+    stands near."""
 
     light: np.ndarray
     specular: float
@@ -78,6 +80,7 @@ class Reflectance:
     directions: np.ndarray
     local_roughness_fit: SpecularEquations | None = None
     light_weights: tuple[float, ...] = ()
+    lamp: NearLamp | None = None
 
     @staticmethod
     def of(
@@ -89,6 +92,7 @@ class Reflectance:
             light=state.light, specular=state.specular, roughness=state.roughness, nodes=precomputed.nodes,
             node_albedo=state.node_albedo, directions=precomputed.directions if directions is None else directions,
             local_roughness_fit=solution.local_roughness_fit, light_weights=solution.light_weights,
+            lamp=solution.lamp,
         )
 
 
@@ -223,6 +227,8 @@ class ShapeSolver:
                 self.appearance.light_moves(self.views.moves),
                 bounce=self.appearance.bounce,
                 light_index=self.views.light_index,
+                lamp=known.lamp,
+                node_points=precomputed.nodes.points,
             )
             return self._shading
         return self._shading.of_points(*place, material)

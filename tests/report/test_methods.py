@@ -95,3 +95,16 @@ def test_export_writes_it_and_the_report_shows_it(tmp_path):
     assert json.loads((job.out / "run.json").read_text())["subject"] == "<b>toy</b>"
     paragraph = next(line for line in (job.out / "methods.txt").read_text().splitlines() if "Reflectance" in line)
     assert paragraph[:60] in page
+
+
+TRIED = [{"distance_mm": None, "held_out": 0.03}, {"distance_mm": 700.0, "held_out": 0.02}]
+
+
+@pytest.mark.parametrize("lamp, says", [
+    ({"near": True, "distance_mm": 650.0, "tried": TRIED}, "main lamp stands 0.65 m from the head"),
+    ({"distance_mm": 500.0}, "main lamp was said to stand 0.50 m from the head"),
+    ({"near": False, "tried": TRIED}, "main lamp is far away"),
+])
+def test_the_lamp_stands_where_the_record_says(lamp, says):
+    assert says in flat(methods_text(records(solve=SOLVE | {"lamp": lamp})))
+    assert "main lamp" not in methods_text(records())
