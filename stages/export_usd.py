@@ -41,6 +41,8 @@ STAGE = Stage(
         Output("envmap.exr", "the light, lat-long", space="world", colour_space="in the file"),
         Output("envmaps/*.exr", "the light of each clip, where there are several", space="world",
                colour_space="in the file", optional=True),
+        Output("envmap_far.exr", "the light without the main lamp, where that stands near", space="world",
+               colour_space="in the file", optional=True),
         Output("poses.npz", "the head's pose in each frame, and the lens", "mm", fields=EXPORTED_POSES),
         Output("plates/*.jpg", "the clip's crops, sRGB; absent when plates is off", space="crop", optional=True),
         Output("renders/*.exr", "re-renders in full source frames", colour_space="in each file"),
@@ -114,8 +116,18 @@ def describe_capture(job: Job, poses: dict, frames):
                       light_with_camera=light_moves(job, frames.moves) != frames.moves)
 
 
-def describe_asset(job: Job, mesh, capture, frames, writer):
-    """The asset that head.usda and head.usdz hold; writes the plates."""
+def near_lamp(solve: dict):
+    """The main lamp that solve.json puts near, as a ball; None where it is far."""
+    from shared.io.usd_capture import BallLamp
+
+    lamp = solve.get("lamp") or {}
+    if "position_mm" not in lamp:
+        return None
+    return BallLamp(tuple(lamp["position_mm"]), lamp["radius_mm"], tuple(lamp["radiance"]))
+
+
+def describe_asset(job: Job, mesh, capture, frames, writer, lamp):
+    """The asset that head.usda and head.usdz hold; writes the plates. lamp: what stands near of the light, or None."""
     from shared.io.plates import crop_rectangle, write_plates
     from shared.io.usd import HeadAsset
     from shared.io.usd_capture import Plate
@@ -135,12 +147,14 @@ def describe_asset(job: Job, mesh, capture, frames, writer):
         "brdf": "albedo / pi + specular_intensity * GGX (Smith, Schlick F0 = 0.04, alpha = roughness^2)",
         "confidence_map": f"maps/{writer.file_name('confidence')}",
     }
-    light = TextureFile("./envmap.exr", writer.colour_space)
-    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, version=str(STAGE.version), metadata=metadata)
+    light = TextureFile("./envmap.exr" if lamp is None else "./envmap_far.exr", writer.colour_space)
+    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, lamp, version=str(STAGE.version),
+                     metadata=metadata)
 
 
 def write_assets(job: Job, asset, poses: dict, maps: dict, envmap) -> None:
-    """mesh.obj, poses.npz, head.usda and its layers; when wished, head.usdz and head.glb."""
+    """mesh.obj, poses.npz, head.usda and its layers; when wished, head.usdz and head.glb. envmap [H, 2 H, 3]: what the
+    asset's dome shows, linear Rec.709."""
     from shared.io.arrays import save_arrays
     from shared.io.gltf import write_glb
     from shared.io.meshes import write_obj
@@ -281,8 +295,12 @@ def run(job: Job) -> None:
     write_images(job, writer, maps, envmap, frames, solve["render_frames"])
     clips = other_clips(job, solve)
     write_lights(job, writer, envmap, clips)
-    asset = describe_asset(job, mesh, describe_capture(job, poses, frames), frames, writer)
-    write_assets(job, asset, poses, maps, envmap)
+    lamp, far = near_lamp(solve), envmap
+    if lamp is not None:
+        far = read_exr(solved / "envmap_far.exr")
+        writer.write_colour(job.out / "envmap_far.exr", far, "radiance, clip maximum 1", latlong=True)
+    asset = describe_asset(job, mesh, describe_capture(job, poses, frames), frames, writer, lamp)
+    write_assets(job, asset, poses, maps, far)
     views = render_views(job, writer, mesh, maps, envmap, poses, frames, solve)
     record = run_record(job, mesh, solve, time.perf_counter() - start)
     write_json(job.out / "run.json", record)

@@ -6,7 +6,7 @@
     /<subject>          Xform, default prim, kind component, assetInfo, inherits /__class__/<subject>
       geo/head          Mesh in millimetres, faceVarying UVs and normals
       mtl/skin          Material: UsdPreviewSurface and OpenPBR
-      capture           camera, dome light and the clip's card, in the variant "clip" of the variant set "capture"
+      capture           camera, lights and the clip's card, in the variant "clip" of the variant set "capture"
 
 The variant "clip" (the default) replays the capture: the head's (or the camera's) motion as time samples, the
 light at rest, the clip on a card of purpose guide. The variant "still" leaves the head alone at head space's
@@ -30,11 +30,13 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, Vt
 from shared.errors import LimnError
 from shared.geometry.mesh import Mesh, shading_normals
 from shared.io.usd_capture import (
+    BallLamp,
     Plate,
     UsdCapture,
     animate,
     define_camera,
     define_dome_light,
+    define_lamp,
     define_plate,
     world_from_head_rigid,
 )
@@ -49,8 +51,9 @@ INTERFACE, PAYLOAD, GEOMETRY, MATERIALS = "head.usda", "head_payload.usda", "hea
 class HeadAsset:
     """Everything that goes into head.usda. Paths are relative to the layer.
 
-    maps: {name of usd_material.SHADER_INPUTS: texture}; envmap: the dome light's texture; plate: the clip's frames, or
-    None; metadata: nested dictionaries of strings, numbers and lists for the root prim's customData["limn"].
+    maps: {name of usd_material.SHADER_INPUTS: texture}; envmap: the dome light's texture; lamp: what stands near of the
+    light and is not in that texture, or None; plate: the clip's frames, or None; metadata: nested dictionaries of
+    strings, numbers and lists for the root prim's customData["limn"].
     """
 
     name: str
@@ -59,6 +62,7 @@ class HeadAsset:
     envmap: TextureFile
     capture: UsdCapture
     plate: Plate | None = None
+    lamp: BallLamp | None = None
     version: str = "1"
     metadata: Mapping[str, object] = field(default_factory=dict)
 
@@ -194,6 +198,8 @@ def _define_capture(stage: Usd.Stage, root: Usd.Prim, asset: HeadAsset) -> None:
     camera = define_camera(stage, str(scope.AppendChild("camera")), capture)
     camera.GetPrim().SetCustomDataByKey("limn", _camera_metadata(capture))
     define_dome_light(stage, str(scope.AppendChild("light")), asset.envmap, capture)
+    if asset.lamp is not None:
+        define_lamp(stage, str(scope.AppendChild("lamp")), asset.lamp, capture)
     if asset.plate is not None:
         define_plate(stage, str(scope.AppendChild("plate")), capture, asset.plate)
     if capture.moves == "head":

@@ -24,6 +24,16 @@ _TENTHS = 10.0
 
 
 @dataclass(frozen=True)
+class BallLamp:
+    """A lamp that stands near as a ball: position [3] mm in the world in which the light stands still, radius_mm, and
+    radiance [3], linear Rec.709, as colours of lights in USD are unless it is said otherwise."""
+
+    position: tuple[float, float, float]
+    radius_mm: float
+    radiance: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
 class UsdCapture:
     """What was filmed: camera_from_head [F, 4, 4] mm, frame_index [F], intrinsics [3, 3] px of a width x
     height frame.
@@ -116,6 +126,19 @@ def animate(prim: UsdGeom.Xformable, world_from_local: np.ndarray, time_codes: n
         translate.Set(Gf.Vec3d(*(float(value) for value in transform[:3, 3])), float(time))
         orient.Set(rotation, float(time))
         last = rotation
+
+
+def define_lamp(stage: Usd.Stage, path: str, lamp: BallLamp, capture: UsdCapture) -> UsdLux.SphereLight:
+    """A lamp at its place, its radiance as colour times intensity; at rest unless the camera carried the light."""
+    light = UsdLux.SphereLight.Define(stage, path)
+    intensity = max(lamp.radiance)
+    light.CreateRadiusAttr(float(lamp.radius_mm))
+    light.CreateIntensityAttr(float(intensity))
+    light.CreateColorAttr(Gf.Vec3f(*(float(value / intensity) for value in lamp.radiance)))
+    if capture.light_with_camera:
+        animate(light, world_from_usd_camera(capture), capture.frame_index)
+    light.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble, "place").Set(Gf.Vec3d(*map(float, lamp.position)))
+    return light
 
 
 def define_dome_light(stage: Usd.Stage, path: str, envmap: TextureFile, capture: UsdCapture) -> UsdLux.DomeLight:

@@ -37,7 +37,7 @@ from shared.io.export_maps import MAPS, acescg_from_rec709, paste_crop
 from shared.io.images import read_exr, read_png, write_exr
 from shared.io.meshes import read_obj
 from shared.io.usd import VARIANT_SET, VARIANT_STILL, prim_name
-from shared.io.usd_capture import UsdCapture, define_camera, define_dome_light
+from shared.io.usd_capture import BallLamp, UsdCapture, define_camera, define_dome_light, define_lamp
 from shared.io.usd_material import TextureFile, modulated_ior
 from shared.io.usd_validate import package_errors, usd_errors
 from shared.io.usdz import write_usdz
@@ -219,6 +219,31 @@ def test_a_lamp_at_the_camera_goes_with_it():
         first, second = (prim.ComputeLocalToWorldTransform(float(frame)) for prim in (light, camera))
         np.testing.assert_allclose(np.array(first)[:3, :3], np.array(second)[:3, :3], atol=1e-12)
     assert not np.allclose(np.array(first)[:3, :3], np.eye(3), atol=0.01)
+
+
+def test_a_near_lamp_stands_at_its_place():
+    """As a ball whose colour times intensity is its radiance; with the camera, where that carries it."""
+    lamp = BallLamp((-500.0, 160.0, -700.0), 35.0, (8.0, 4.0, 2.0))
+    for with_camera in (False, True):
+        moves = "camera" if with_camera else "head"
+        capture = UsdCapture(toy_poses(), FRAMES, 25.0, INTRINSICS, *SOURCE_SIZE, moves, light_with_camera=with_camera)
+        stage = Usd.Stage.CreateInMemory()
+        light, camera = define_lamp(stage, "/lamp", lamp, capture), define_camera(stage, "/camera", capture)
+        assert light.GetRadiusAttr().Get() == 35.0
+        radiance = np.array(light.GetColorAttr().Get()) * light.GetIntensityAttr().Get()
+        np.testing.assert_allclose(radiance, lamp.radiance, rtol=1e-6)
+        for frame in FRAMES:
+            place = np.array(light.ComputeLocalToWorldTransform(float(frame)))[3, :3]
+            expected = np.array([*lamp.position, 1.0]) if with_camera else np.array(lamp.position)
+            if with_camera:
+                expected = (expected @ np.array(camera.ComputeLocalToWorldTransform(float(frame))))[:3]
+            np.testing.assert_allclose(place, expected, atol=1e-9)
+
+
+def test_solve_json_says_where_a_lamp_stands():
+    said = {"near": True, "position_mm": [1.0, 2.0, 3.0], "radius_mm": 4.0, "radiance": [5.0, 6.0, 7.0]}
+    assert export_usd.near_lamp({"lamp": said}) == BallLamp((1.0, 2.0, 3.0), 4.0, (5.0, 6.0, 7.0))
+    assert export_usd.near_lamp({"lamp": {"near": False}}) is None and export_usd.near_lamp({}) is None
 
 
 def test_dome_light_layout_is_that_of_the_environment_map():
