@@ -32,9 +32,9 @@ from shared.rendering.shading import light_along
 from shared.rendering.transfer import spread_vertices
 from shared.selection.candidates import gain
 
-FIRST_MM, TRIED_MM = 700.0, ((500.0, 400.0), (1000.0, 1500.0, FAR))
-"""From the first distance on to nearer ones, as long as these serve, and to farther ones, each from the light at the
-one before; far away from the light that was solved there, too, so that no lamp is near because far was not reached."""
+TRIED_MM = (1500.0, 1000.0, 700.0, 500.0, 400.0)
+"""From far away on to nearer ones, as long as these serve, each from the light at the one before: a far lamp costs two
+fits."""
 NEAREST_MM = 300.0
 """Nearer, a lamp would stand among hair and shoulders."""
 POINTS, FIRST_STEPS, STEPS = 400, 8, 3
@@ -180,15 +180,12 @@ def solve_distance(
         note(f"lamp at {distance:.0f} mm: residual {found.held_out:.5f} held out")
         return found
 
-    tried[FIRST_MM] = fit(FIRST_MM, fit(FIRST_MM, start, FIRST_STEPS, shapes=True), STEPS)
-    for way in TRIED_MM:
-        last = tried[FIRST_MM]
-        for distance in way:
-            before, last = last, fit(distance, last, STEPS)
-            tried[distance] = last
-            if last.held_out > before.held_out and FAR not in way:
-                break
-    tried[FAR] = min(tried[FAR], fit(FAR, start, FIRST_STEPS, shapes=True), key=lambda one: one.held_out)
+    last = tried[FAR] = fit(FAR, start, FIRST_STEPS, shapes=True)
+    for distance in TRIED_MM:
+        before, last = last, fit(distance, last, STEPS)
+        tried[distance] = last
+        if last.held_out > before.held_out:
+            break
     between = _least_between(tried)
     if between is not None:
         nearest = min(tried, key=lambda one: abs(1.0 / one - 1.0 / between))
