@@ -111,8 +111,8 @@ def track_head(
         searching = beside.submit(focal_elsewhere, few, found)
         fit, _ = heads.fit(few, found, rough=True)
         elsewhere = searching.result()
-    poses, known = _onto_all(clip, model, chosen, fit, found)
-    found = _texture_pass(clip, model, fit, poses, known, coarse_pass(clip.face_width_px), progress)
+    poses, between, known = _onto_all(clip, model, chosen, fit, found)
+    found = _coarse_pass(clip, model, fit, poses, between, known, progress)
     note(_summary("tracks", found))
     refuse_still_head(found.solution.camera_from_points[found.reliable])
     fine = TrackingPass(
@@ -166,14 +166,18 @@ def refuse_still_head(camera_from_head: np.ndarray) -> None:
         )
 
 
-def _onto_all(clip, model, chosen, fit, found) -> tuple[np.ndarray, np.ndarray]:
-    """Poses of all frames from those of the chosen, and which of them are known [F] bool."""
+def _onto_all(clip, model, chosen, fit, found) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses of all frames from those of the chosen, with what their landmarks say and as interpolation alone has them,
+    and which are known [F] bool."""
     poses = fit.camera_from_head(found.solution.camera_from_points)
     if clip.hold_poses:
-        return carried_poses(clip.given_poses, clip.given_poses[chosen], poses), np.ones(clip.count, bool)
+        held = carried_poses(clip.given_poses, clip.given_poses[chosen], poses)
+        return held, held, np.ones(clip.count, bool)
     known = np.zeros(clip.count, bool)
     known[chosen[found.reliable]] = True
-    return follow_landmarks(clip, known_landmarks(model, fit.vertices), poses[found.reliable], known), known
+    poses = poses[found.reliable]
+    between = interpolate_poses(poses, clip.time_s[known], clip.time_s)
+    return follow_landmarks(clip, known_landmarks(model, fit.vertices), poses, known), between, known
 
 
 def follow_landmarks(clip: TrackedClip, named: np.ndarray, poses: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -213,10 +217,31 @@ def carried_poses(poses: np.ndarray, source: np.ndarray, target: np.ndarray) -> 
     return rigid(poses[:, :3, :3] @ turn, scale * poses[:, :3, 3] + poses[:, :3, :3] @ shift)
 
 
-def _texture_pass(clip, model, fit, poses, known, settings, progress) -> Adjusted:
+def _coarse_pass(clip, model, fit, poses, between, known, progress) -> Adjusted:
+    """All frames, wherever they were believed to be. A frame whose landmarks say that the head was elsewhere than
+    between [F, 4, 4] is looked for at both places: a sudden start leads the one astray, half a face in the dark the
+    other."""
+    settings = coarse_pass(clip.face_width_px)
+    doubtful = (poses != between).any((1, 2))
     tracked = np.ones(clip.count, bool)
-    tracks, points, poses = track_texture(clip, model, fit.vertices, poses, known, tracked, settings, progress)
-    return solve_texture(clip, tracks, points, poses, settings.prior_mm)
+    tracks, points, found = track_texture(clip, model, fit.vertices, poses, known, tracked, settings, progress)
+    if doubtful.any():
+        others, _, elsewhere = track_texture(clip, model, fit.vertices, between, known, doubtful, settings, progress)
+        agree = [agreement(own, points, way, clip.intrinsics, settings.texel_px)
+                 for own, way in ((tracks, found), (others, elsewhere))]
+        better = doubtful & (agree[1] > agree[0])
+        tracks.pixels[better], tracks.whitening[better] = others.pixels[better], others.whitening[better]
+        found[better] = elsewhere[better]
+    return solve_texture(clip, tracks, points, found, settings.prior_mm)
+
+
+def agreement(
+    tracks: Tracks, points: np.ndarray, poses: np.ndarray, intrinsics: np.ndarray, scale_px: float
+) -> np.ndarray:
+    """[F]: how many tracks of each frame agree with its pose [4, 4], each counting less the farther it is off, half at
+    scale_px; points [N, 3] mm."""
+    off = np.linalg.norm(project(points, poses, intrinsics)[0] - tracks.pixels, axis=2)
+    return np.nansum(1.0 / (1.0 + np.square(off / scale_px)), axis=1)
 
 
 def _fine_pass(clip, model, fit, poses, reliable, settings, progress) -> tuple[Adjusted, tuple[Tracks, np.ndarray]]:

@@ -14,9 +14,10 @@ from shared.geometry.transforms import project, rigid, rotation_from_vector
 from shared.io.arrays import load_arrays
 from shared.io.images import read_png, write_png
 from shared.tracking import track_head
+from shared.tracking.bundle import Tracks
 from shared.tracking.first_poses import interpolate_poses
 from shared.tracking.pose_uncertainty import rotations_apart
-from shared.tracking.track_head import carried_poses, follow_landmarks, refuse_still_head
+from shared.tracking.track_head import agreement, carried_poses, follow_landmarks, refuse_still_head
 from shared.tracking.tracked_clip import TrackedClip
 from stages import sample_frames, track_landmarks
 
@@ -147,3 +148,16 @@ def test_a_pose_that_its_landmarks_contradict_is_not_followed(monkeypatch):
     monkeypatch.setattr(track_head, "landmark_poses", lambda *_: [*honest[:5], lost, *honest[6:]])
     straight = interpolate_poses(poses[known], clip.time_s[known], clip.time_s)
     assert np.abs(follow_landmarks(clip, named, poses[known], known) - straight).max() < 1e-12
+
+
+def test_tracks_tell_which_of_two_poses_a_frame_has():
+    """With the right pose all agree, with one that is half the scale off four fifths, with one far off hardly any;
+    tracks that a frame does not show say nothing."""
+    named = np.nan_to_num(landmark_model())
+    poses = nods(np.array([5.0, 5.0, 5.0, 5.0]))
+    pixels, _ = project(named, poses, INTRINSICS)
+    pixels[1] += [0.5, 0.0]
+    pixels[2] += [30.0, 40.0]
+    pixels[3, 100:] = np.nan
+    found = agreement(Tracks.of_equal_noise(pixels, 1.0), named, poses, INTRINSICS, 1.0)
+    np.testing.assert_allclose(found, [468, 468 / 1.25, 468 / 2501, 100], rtol=1e-6)
