@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from shared.errors import InputError
-from shared.io.arrays import read_json
+from shared.io.arrays import read_json, write_json
 from shared.io.images import read_png
 from tools.bench import real
-from tools.bench.real import COLUMNS, RealBench, all_clips
+from tools.bench.real import COLUMNS, RealBench, all_clips, record_columns
 from tools.bench.real_page import TILE_PX, head_window, html_page, tiled
 from tools.bench.rerender import SolvedClip, filled_and_unclipped, region_pixels
 from tools.bench.runner import run
@@ -114,6 +114,7 @@ def test_a_clip_is_run_and_measured_once(tiny_run, clips, tmp_path, monkeypatch)
     assert "no face" in ben["refused"] and anna["held_out"] >= 1 and anna["frames"] == 12
     assert 20.0 < anna["skin_db"] < 60.0 and 0.5 < anna["skin_ssim"] <= 1.0 and anna["detail"] > 0.0
     assert anna["roughness_end"] == "" and anna["jitter_deg"] > 0.0 and anna["peak_mb"] > 100
+    assert anna["highlights_fitted"] is True and anna["roughness"] != 0.45
     sheet = read_png(out / "sheets" / "anna.png")
     assert sheet.shape == (TILE_PX * min(anna["held_out"], 4), 5 * TILE_PX, 3)
     assert "sheets/anna.png" in (out / "real.html").read_text() and "| skin_db |" in (out / "real.md").read_text()
@@ -122,6 +123,21 @@ def test_a_clip_is_run_and_measured_once(tiny_run, clips, tmp_path, monkeypatch)
     (clips / "clips.yaml").write_text("anna: {moves: camera}\n")
     commands.clear()
     assert bench(*words, "--only", "anna") == 0 and any("--moves" in command for command in commands)
+
+
+def test_highlights_that_stayed_what_they_were_are_told(tiny_run, tmp_path):
+    """The record of the tiny subject's run, as if its highlights had been left out of the fit."""
+    for stage in ("track_landmarks", "inverse_render"):
+        (tmp_path / "work" / stage).mkdir(parents=True)
+        for path in (tiny_run / "work" / stage).glob("*.json"):
+            shutil.copy(path, tmp_path / "work" / stage)
+    solved = tmp_path / "work" / "inverse_render" / "solve.json"
+    solve = read_json(solved)
+    for highlights, fitted, end in ((0.7, False, ""), (2.0, True, "upper")):
+        solve["model"] |= {"roughness": 0.45, "specular_intensity": highlights}
+        write_json(solved, solve)
+        row = record_columns(tmp_path)
+        assert (row["highlights_fitted"], row["specular_end"]) == (fitted, end)
 
 
 def test_regions_of_a_run_lie_in_its_head(tiny_run):

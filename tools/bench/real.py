@@ -14,7 +14,8 @@ Columns  skin_, eyes_, lips_, head_: PSNR linear (db) and of sRGB codes (srgb_db
          that are clipped count nowhere, clipped_share is theirs of the skin. detail: sharpness of the mean texture
          under the final poses, tracked_detail under the tracked ones (python -m tools.bench.whole_run). jitter_:
          median second difference of the final poses, per frame squared; tracked_jitter_: of the tracked ones.
-         roughness_end, specular_end: the end of its range that the fit reached. refused: why the run ended early.
+         roughness_end, specular_end: the end of its range that the fit reached. highlights_fitted: false where both
+         stayed what they were before the fit, as after a step that had to be undone. refused: why the run ended early.
 Resumes  rows of the same clip, arguments and code are kept.
 """
 
@@ -54,8 +55,8 @@ REGION_COLUMNS = tuple(f"{region}_{kind}" for region in ("skin", "eyes", "lips",
 COLUMNS = (
     "case", "told", "frames", "held_out", *REGION_COLUMNS, "skin_pixels", "clipped_share", "detail", "tracked_detail",
     "jitter_deg", "jitter_across_mm", "jitter_depth_mm", "tracked_jitter_deg", "roughness", "roughness_end", "specular",
-    "specular_end", "reprojection_p95_px", "noise_factor", "focal_gain", "rotation_range_deg", "fitted_residual",
-    "held_out_residual", "wall_s", "cpu_s", "peak_mb", "warnings", "refused",
+    "specular_end", "highlights_fitted", "reprojection_p95_px", "noise_factor", "focal_gain", "rotation_range_deg",
+    "fitted_residual", "held_out_residual", "wall_s", "cpu_s", "peak_mb", "warnings", "refused",
 )  # fmt: skip
 
 
@@ -129,14 +130,16 @@ def pose_columns(run: Path) -> dict[str, float]:
 def record_columns(run: Path) -> dict[str, object]:
     """What the stages' own records say of tracking, material and residuals."""
     tracking = read_json(run / "work" / "track_landmarks" / "tracking.json")
-    solve = read_json(run / "work" / "inverse_render" / "solve.json")
+    solve, given = (read_json(run / "work" / "inverse_render" / name) for name in ("solve.json", "manifest.json"))
     roughness, specular = solve["model"]["roughness"], solve["model"]["specular_intensity"]
+    before = given["parameters"]["roughness"], given["parameters"]["specular_prior"]
     return {
         "frames": tracking["frames"],
         "roughness": roughness,
         "roughness_end": reached_end(roughness, ROUGHNESS_RANGE),
         "specular": specular,
         "specular_end": reached_end(specular, SPECULAR_RANGE),
+        "highlights_fitted": (roughness, specular) != before,
         "reprojection_p95_px": tracking["reprojection_px"]["p95"],
         "noise_factor": tracking["noise_factor"],
         "focal_gain": tracking["focal"]["gain"],
