@@ -45,7 +45,7 @@ LEAST_MATTE_SHARE = 0.05
 LEAST_BORDER_MM = 0.5
 """Error of where the head's outline lies, however well its surface is known."""
 
-MISFIT = 5.0
+ERROR_OVER_SCATTER = 5.0
 """Variance of a texel's log albedo over the relative variance of what single frames say of it: what is wrong in some
 frames (a normal, the place of a shadow) mostly is wrong the same way in the others. Measured under hard lamps: 9 where
 frames contradict each other by 7 %, 6 by 15 %, 4 by 40 %."""
@@ -223,7 +223,7 @@ class BorderSums:
         return np.square(self.error * count / np.maximum(weight, 1e-3))
 
 
-class MisfitSums:
+class ScatterSums:
     """By how much frames contradict each other about each of T texels. sums [T, 12]: of e^2, e m and m^2 by the
     precision of the samples, three channels each, and of their weights, with m the modelled diffuse radiance and e the
     model's error. Robust weights would leave out the very samples that count here, and bounds contradict nothing."""
@@ -239,11 +239,11 @@ class MisfitSums:
                     self.sums)
 
     def variance(self) -> np.ndarray:
-        """[T, 3] of the log albedo: MISFIT times the relative variance of E[e^2] beyond a common factor, which is the
-        albedo's, and beyond the samples' noise."""
+        """[T, 3] of the log albedo: ERROR_OVER_SCATTER times the relative variance of errors, beyond a common factor,
+        which is the albedo's, and beyond the samples' noise."""
         squared, along, power, weight = (self.sums[:, 3 * k : 3 * k + 3] for k in range(4))
         power = np.maximum(power, 1e-6)
-        return MISFIT * np.maximum(squared - along**2 / power - weight, 0.0) / power
+        return ERROR_OVER_SCATTER * np.maximum(squared - along**2 / power - weight, 0.0) / power
 
 
 @compiled

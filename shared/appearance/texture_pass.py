@@ -15,9 +15,9 @@ from shared.appearance.texture import (
     PRIOR_SPREAD,
     BorderSums,
     Evidence,
-    MisfitSums,
     Noise,
     NormalEquations,
+    ScatterSums,
     TexelMaterial,
     pooled_specular,
     robust_weight,
@@ -120,16 +120,16 @@ class TexturePass:
     def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> Evidence:
         parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]
         borders = [BorderSums(len(self.surface), self.viewer.error_mm) for _ in self.systematic]
-        misfits = [MisfitSums(len(self.surface), self.noise) for _ in self.systematic]
+        scatters = [ScatterSums(len(self.surface), self.noise) for _ in self.systematic]
         ahead = work_ahead(self.view, self.progress(frames, label))
         for f, view in zip(frames, ahead, strict=True):
-            part, border, misfit = (sums[self.views.light_index[f]] for sums in (parts, borders, misfits))
-            self._share_out(view, partial(self._add, material, part, border, misfit))
+            part, border, scatter = (sums[self.views.light_index[f]] for sums in (parts, borders, scatters))
+            self._share_out(view, partial(self._add, material, part, border, scatter))
         for part, weight in zip(parts, self.light_weights, strict=True):
             part.scale(weight)
         systematic = [error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
-                      + part.highlight_variance(self.specular) + misfit.variance()
-                      for error, border, part, misfit in zip(self.systematic, borders, parts, misfits, strict=True)]
+                      + part.highlight_variance(self.specular) + scatter.variance()
+                      for error, border, part, scatter in zip(self.systematic, borders, parts, scatters, strict=True)]
         return weigh_lights(parts, systematic, self.typical_albedo)
 
     def view(self, f: int) -> FrameView:
@@ -152,18 +152,18 @@ class TexturePass:
         return share_out(len(blocks), of_block)
 
     def _add(
-        self, material: TexelMaterial | None, part: NormalEquations, border: BorderSums, misfit: MisfitSums,
+        self, material: TexelMaterial | None, part: NormalEquations, border: BorderSums, scatter: ScatterSums,
         lit: LitSamples,
     ) -> None:
         """A block's samples to its light's sums; without a material every sample that is not at a limit counts, and
-        nothing is known of misfits."""
+        nothing is known of how frames scatter."""
         samples = lit.samples
         if material is None:
             robust = (samples.saturation == 0).astype(np.float32)
         else:
             model = lit.model(material)
             robust = robust_weight(model, samples, self.noise, material.information, lit.shadow)
-            misfit.add(samples, model, material.albedo[samples.rows] * lit.irradiance, lit.shadow)
+            scatter.add(samples, model, material.albedo[samples.rows] * lit.irradiance, lit.shadow)
         part.add(samples, lit.irradiance, lit.reflection, robust, lit.shadow)
         border.add(samples)
 

@@ -22,7 +22,7 @@ class Factors:
     precision: np.dtype
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """x [n] or [n, k] of matrix x = right, in the matrix's precision."""
+        """x of matrix x = right, right [n] or [n, k], in the matrix's precision."""
         return self.superlu.solve(right.astype(self.precision, copy=False))
 
 

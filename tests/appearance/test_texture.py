@@ -5,13 +5,13 @@ import pytest
 from shapes import grid_plane
 
 from shared.appearance.texture import (
+    ERROR_OVER_SCATTER,
     LEAST_BORDER_MM,
-    MISFIT,
     PRIOR_SPREAD,
     BorderSums,
-    MisfitSums,
     Noise,
     NormalEquations,
+    ScatterSums,
     pooled_specular,
     robust_weight,
 )
@@ -141,9 +141,9 @@ def test_errors_of_highlights_count_by_their_share():
     assert np.allclose(by_texel[[0, 2, 3]], variance[[0, 2, 3]]) and (by_texel[1] < 0.5 * variance[1]).all()
 
 
-def test_misfit_is_what_frames_contradict_each_other_by():
+def test_scatter_is_what_frames_contradict_each_other_by():
     """Relative errors of +-0.4 in frames of one brightness have the variance 0.16; an error that all frames share is
-    the albedo's; clipped samples contradict nothing, and noise is no misfit."""
+    the albedo's; clipped samples contradict nothing, and noise is no scatter."""
     frames, texels, radiance = 400, 4, 0.3
     rng = np.random.default_rng(0)
     sigma = NOISE.absolute + NOISE.relative * radiance
@@ -155,11 +155,11 @@ def test_misfit_is_what_frames_contradict_each_other_by():
     model[:, 3] *= 1.0 + 0.4 * (-1.0) ** np.arange(frames)[:, None]
     saturation = np.zeros(colours.shape, np.int8)
     saturation[:, 3] = 1
-    sums, rows = MisfitSums(texels, NOISE), np.arange(texels)
+    sums, rows = ScatterSums(texels, NOISE), np.arange(texels)
     for f in range(frames):
         samples = TexelSamples(rows, colours[f], np.full(texels, 0.5), saturation[f])
         sums.add(samples, model[f], model[f], np.zeros((texels, 3)))
-    variance = sums.variance() / MISFIT
+    variance = sums.variance() / ERROR_OVER_SCATTER
     # About the best common factor, which is 1 / 1.16: sum (1.4 x - 1)^2 + (0.6 x - 1)^2 over sum of their squares.
     best = 1.0 / 1.16
     expected = ((1.4 * best - 1) ** 2 + (0.6 * best - 1) ** 2) / (1.4**2 + 0.6**2)

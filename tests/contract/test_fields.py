@@ -88,6 +88,7 @@ ELSEWHERE = {
         "iteration", "image", "mask", "laplacian", "white_light", "diffuse", "roughness_variation")},
     "test_fit_appearance": {"iterations[].undone"},
     "test_refine_shape": {"solve.json: shape.fitted"},
+    "test_lamp_distance": {"solve.json: lamp", "run.json: lamp"},
 }
 """Tests that compare what the tiny run has no occasion to write."""
 

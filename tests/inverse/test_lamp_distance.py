@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from field_check import below, field_faults
 from toy_capture import MATTE, make_truth, small_lamp, swinging, under_true_light
 
 from shared.appearance.fit import Solution, fit_appearance
 from shared.appearance.problem import AppearanceProblem
+from shared.contract.records import SOLVE
 from shared.errors import InputError
 from shared.geometry.mesh import normalised
 from shared.geometry.transforms import places_in_world
@@ -66,6 +68,7 @@ def test_the_distance_of_a_lamp_is_found(truth, distance):
     assert record["near"] and record["fall"] > record["standard_error"]
     said = describe_lamp(found.lamp, found.state.light, record, Poses, "head")
     assert said["distance_mm"] == pytest.approx(distance, rel=0.15)
+    assert field_faults(said, below(SOLVE, "lamp")) == []
     truth_mm = lamp_at(distance).position
     assert np.linalg.norm(np.subtract(said["position_mm"], truth_mm)) < 0.2 * distance
 
