@@ -166,7 +166,7 @@ class _ClipSelection:
             sizes=self.small.sizes,
             settings=shape,
             context=self.context,
-            begun=self.small.refined,
+            begun=None if self.small.refined is None else self.small.surface.mesh,
         )
         small = SmallClip(self.views, refined.surface, self.settings, self.chart, self.context, refined)
         selection = self._selection(small)

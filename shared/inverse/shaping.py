@@ -14,6 +14,7 @@ import numpy as np
 from shared.appearance.chart_scale import ChartStatement
 from shared.appearance.fit import Solution, fit_appearance
 from shared.compute.run_context import RunContext
+from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface
 from shared.imaging.views import Views
 from shared.inverse.clip_inputs import TrackedPoses
@@ -51,8 +52,8 @@ def shape_and_turn(
     directions, start = suited_directions(lit, solution), lit.surface
     context.note(f"light is summed along {len(directions)} directions")
 
-    def refined_from(views: Views, lit: LitSurface, solution: Solution) -> RefinedMesh:
-        return refine_and_light(views, start, lit, solution, settings, chart, context, directions)
+    def refined_from(views: Views, lit: LitSurface, solution: Solution, begun: Mesh | None = None) -> RefinedMesh:
+        return refine_and_light(views, start, lit, solution, settings, chart, context, directions, begun)
 
     shaped = Shaped(views, lit, solution)
     if settings.shape is not None and start.face_segment is not None:
@@ -68,7 +69,7 @@ def shape_and_turn(
                 shaped = replace(shaped, pose_record=again.record)
                 if again.serves:
                     views = replace(views, camera_from_head=again.camera_from_head)
-                    refined = refined_from(views, refined.lit, refined.solution)
+                    refined = refined_from(views, refined.lit, refined.solution, mesh_so_far.mesh)
                     record = judge_shape(solution, refined.solution) | {"stopped_vertices": refined.stopped}
                     context.note(f"refined mesh, poses anew: {record}")
                     if record["refined"]:
@@ -106,9 +107,10 @@ def refine_and_light(
     chart: ChartStatement | None,
     context: RunContext,
     directions: np.ndarray,
+    begun: Mesh | None = None,
 ) -> RefinedMesh:
     """A surface's mesh refined under a solved light, and the light anew; lit: what the light was solved on; directions
-    [J, 3] that light is summed along."""
+    [J, 3] that light is summed along; begun: the mesh as it was refined before."""
     refined = refine_shape(
         some_views(views, settings, settings.shape.frames),
         surface,
@@ -117,6 +119,7 @@ def refine_and_light(
         sizes=settings.sizes,
         settings=settings.shape,
         context=context,
+        begun=begun,
     )
     light_views = some_views(views, settings, settings.light_frames)
     lit = LitSurface.of(refined.surface, light_views, settings, chart, context, surface.mesh, directions, solution.lamp)

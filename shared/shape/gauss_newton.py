@@ -1,8 +1,9 @@
 """Shape from parallax and shading together, under a light and a reflectance that are known: Gauss-Newton steps.
 
 Each step samples the frames at the vertices, shades the vertices, sums up what the samples say of place and normal, and
-solves one sparse system. Visibility and bounces are traced anew after each step. Frames that were held out decide
-whether a step is kept.
+solves one sparse system. What the vertices see is traced on the mesh as it is, held for a few steps and traced again
+while that helps: beside the nose, below it and between the lips the surface covers itself, and what a step moves there
+is most of what it sees. Frames that were held out decide whether a step is kept.
 """
 
 from __future__ import annotations
@@ -50,13 +51,15 @@ BLUR_EDGES = 0.4
 
 @dataclass(frozen=True)
 class ShapeSettings:
-    """subdivisions: finer levels beyond the given mesh; rounds: most steps per level; frames: that the shape is solved
-    from; smoothness: lambda of the large steps; sigma_mm: how far the surface may be from the start as a whole;
-    contour: how the outline is met first, None: it is not; looks_back: the last step of a level is judged, too, and not
-    only the mesh by whoever asked for it."""
+    """subdivisions: finer levels beyond the given mesh; rounds: most steps before the surface is traced again; traces:
+    how often it is at most on the given mesh; finer levels are traced once; frames: that the shape is solved from;
+    smoothness: lambda of the large steps; sigma_mm: how far the surface may be from the start as a whole; contour: how
+    the outline is met first, None: it is not; looks_back: the last step of a level is judged, too, and not only the
+    mesh by whoever asked for it."""
 
     subdivisions: int = 1
     rounds: int = 2
+    traces: int = 3
     frames: int = 32
     smoothness: float = 19.0
     sigma_mm: float = 8.0
@@ -96,6 +99,8 @@ class Reflectance:
         )
 
 
+WORTHWHILE = 0.01
+"""Once traced again, a level whose held-out residual did not fall by this fraction is at rest."""
 MOST_WORSE = 1
 """Steps in a row after which held-out frames may fit worse: the first of a finer level often is one by a hair, and the
 next more than makes up for it. The best of all stays."""
@@ -113,19 +118,15 @@ class ShapedSurface:
 
 @dataclass(frozen=True)
 class Traced:
-    """What is looked up once per level, since steps move the surface by far less than what it sees is away: the
-    points of vertices index [P] and their transfer, how the frames see them, and what they reflect (None: nothing)."""
+    """What is looked up once for a few steps: the points of vertices index [P], their transfer and shading, how the
+    frames see them, and what they reflect (None: nothing)."""
 
     precomputed: PrecomputedTransfer
     index: np.ndarray
-    points: Points
     transfer: Transfer
+    shading: VertexShading
     looks: list[SurfaceView]
     reflections: Reflections | None
-
-    def kept(self) -> Traced:
-        """What a finer level needs of it: neither pictures nor reflections."""
-        return replace(self, looks=[], reflections=None)
 
     def turned_to(self, normals: np.ndarray) -> Transfer:
         """The transfer for other normals [P, 3] under the same visibility."""
@@ -157,30 +158,22 @@ class ShapeSolver:
     ):
         self.views, self.tracks, self.reflectance = views, tracks, reflectance
         self.appearance, self.sizes, self.settings, self.context = appearance, sizes, settings, context
-        self._shading: VertexShading | None = None
 
-    def trace(self, mesh: Mesh, shaped: np.ndarray, before: Traced | None = None) -> Traced:
-        """Looks at the shaped faces' vertices that some frame faces. before: of a coarser level, whose nearest point
-        tells what each sees. shaped [F] bool: the faces that may move."""
+    def trace(self, mesh: Mesh, shaped: np.ndarray) -> Traced:
+        """Looks at the shaped faces' vertices that some frame faces. shaped [F] bool: the faces that may move."""
         views, viewer = self.views, SurfaceViewer.of(mesh)
         wanted = np.zeros(len(mesh.vertices), bool)
         wanted[mesh.faces[shaped]] = True
         index = np.nonzero(wanted & face_front(viewer, views.camera_from_head, 0.2))[0]
         points = mesh_points(mesh, index)
-        if before is None:
-            precomputed = precompute_transfer(
-                viewer, self.sizes, self.appearance.visibility, self.reflectance.directions
-            )
-            transfer = precomputed.trace(points)
-        else:
-            precomputed, transfer = before.precomputed, before.transfer.take(nearest_points(points, before.points))
+        precomputed = precompute_transfer(viewer, self.sizes, self.appearance.visibility, self.reflectance.directions)
+        transfer = precomputed.trace(points)
+        shading = self._shading(mesh, index, points, transfer, precomputed)
         blur = BLUR_EDGES * typical_edge(mesh.vertices, mesh.faces[shaped])
         looks = look_at_surface(viewer, index, views, blur, self.context)
-        traced = Traced(precomputed, index, points, transfer, looks, None)
-        if not self.appearance.specular or len(index) < FEWEST_POINTS:
-            return traced
-        shading = self._shade(mesh, traced, points, traced.turned_to(points.normals))
-        return replace(traced, reflections=Reflections(shading, np.arange(len(index))))
+        shines = self.appearance.specular and len(index) >= FEWEST_POINTS
+        reflections = Reflections(shading, np.arange(len(index))) if shines else None
+        return Traced(precomputed, index, transfer, shading, looks, reflections)
 
     def examine(self, mesh: Mesh, shaped: np.ndarray, traced: Traced) -> ShapedSurface | None:
         """Samples, shading and equations of the traced vertices; None where hardly any is seen. shaped [F] bool: the
@@ -195,7 +188,8 @@ class ShapeSolver:
         rows = np.nonzero(seen & (transfer.blocked < DEEP))[0]
         if len(rows) < FEWEST_POINTS:
             return None
-        shading = self._shade(mesh, traced, points, transfer)
+        material = self._material(points, traced.precomputed)
+        shading = traced.shading.of_points(index, mesh.vertices, points, transfer, material)
         samples = samples.points(rows)
         terms = shading_terms(shading, rows, traced.reflections)
         points = points.take(rows)
@@ -210,28 +204,32 @@ class ShapeSolver:
         )
         return ShapedSurface(mesh, index[rows], terms.tangents, equations)
 
-    def _shade(self, mesh, traced: Traced, points, transfer) -> VertexShading:
-        known, precomputed = self.reflectance, traced.precomputed
+    def _shading(
+        self, mesh: Mesh, index: np.ndarray, points: Points, transfer: Transfer, precomputed: PrecomputedTransfer
+    ) -> VertexShading:
+        known, views = self.reflectance, self.views
+        return VertexShading(
+            index,
+            mesh.vertices,
+            points,
+            transfer,
+            precomputed.node_transfer,
+            self._material(points, precomputed),
+            known.light,
+            precomputed.directions,
+            views.camera_from_head,
+            self.appearance.light_moves(views.moves),
+            bounce=self.appearance.bounce,
+            light_index=views.light_index,
+            lamp=known.lamp,
+            node_points=precomputed.nodes.points,
+        )
+
+    def _material(self, points: Points, precomputed: PrecomputedTransfer) -> Material:
+        known = self.reflectance
         local = None if known.local_roughness_fit is None else known.local_roughness_fit.roughness(points.positions)
         node_albedo = known.node_albedo[nearest_points(precomputed.nodes.points, known.nodes.points)]
-        material = Material(node_albedo, known.specular, known.roughness, local)
-        place = traced.index, mesh.vertices, points, transfer
-        if self._shading is None:  # all levels and steps have its light and its nodes
-            self._shading = VertexShading(
-                *place,
-                precomputed.node_transfer,
-                material,
-                known.light,
-                precomputed.directions,
-                self.views.camera_from_head,
-                self.appearance.light_moves(self.views.moves),
-                bounce=self.appearance.bounce,
-                light_index=self.views.light_index,
-                lamp=known.lamp,
-                node_points=precomputed.nodes.points,
-            )
-            return self._shading
-        return self._shading.of_points(*place, material)
+        return Material(node_albedo, known.specular, known.roughness, local)
 
     def step(self, surface: ShapedSurface, start: np.ndarray, shaped: np.ndarray, held: np.ndarray) -> np.ndarray:
         """Offsets [V] along the normals. start [V, 3] mm: vertices of the level's first mesh; shaped [F] bool: the
@@ -252,38 +250,46 @@ class ShapeSolver:
         return np.clip(offsets, -largest, largest)
 
     def refine(
-        self, mesh: Mesh, shaped: np.ndarray, held: np.ndarray, begun: tuple[Mesh, Traced] | None = None
-    ) -> tuple[Mesh, Mesh, Traced | None]:
-        """The mesh subdivided as the settings say, as it was and refined, and what was traced last. shaped, held
-        [faces] bool; begun: the mesh, or a subdivision of it, as it was refined before, with what was traced then: goes
-        on from the next one."""
-        start, (mesh, traced) = mesh, begun or (mesh, None)
-        finished = len(mesh.faces) if begun else 0
+        self, mesh: Mesh, shaped: np.ndarray, held: np.ndarray, begun: Mesh | None = None
+    ) -> tuple[Mesh, Mesh]:
+        """The mesh subdivided as the settings say, as it was and refined. shaped, held [faces] bool; begun: the mesh,
+        or a subdivision of it, as it was refined before: goes on from the next level, or on the finest one."""
+        start, mesh, finished = mesh, begun or mesh, 0 if begun is None else len(begun.faces)
         for level in range(self.settings.subdivisions + 1):
             if level > 0:
                 shaped, held, start = np.repeat(shaped, 4), np.repeat(held, 4), subdivide(start)
-            if finished >= len(start.faces):
+            if level < self.settings.subdivisions and finished >= len(start.faces):
                 continue
             if len(mesh.faces) < len(start.faces):
                 mesh = subdivide(mesh)
-            traced = self.trace(mesh, shaped, traced)
-            mesh = self._refine_level(mesh, start.vertices, shaped, held, level, traced)
-        return start, mesh, traced
+            traces = self.settings.traces if level == 0 else 1
+            mesh = self._refine_level(mesh, start.vertices, shaped, held, level, traces)
+        return start, mesh
 
-    def _refine_level(self, mesh, start, shaped, held, level, traced: Traced) -> Mesh:
-        surface = self.examine(mesh, shaped, traced)
-        if surface is None:
-            self.context.note(f"shape level {level}: too little of the face is seen, the mesh stays")
-            return mesh
-        self.context.note(f"shape level {level}: {len(surface.index)} points, {_residuals(surface)}")
+    def _refine_level(self, mesh, start, shaped, held, level, traces) -> Mesh:
+        last = np.inf
+        for _ in range(traces):
+            traced = self.trace(mesh, shaped)
+            surface = self.examine(mesh, shaped, traced)
+            if surface is None:
+                self.context.note(f"shape level {level}: too little of the face is seen, the mesh stays")
+                break
+            self.context.note(f"shape level {level}: {len(surface.index)} points, {_residuals(surface)}")
+            if surface.equations.judged > last * (1.0 - WORTHWHILE):
+                break
+            mesh, last = self._stepped(surface, start, shaped, held, traced), surface.equations.judged
+        return mesh
+
+    def _stepped(self, surface: ShapedSurface, start, shaped, held, traced: Traced) -> Mesh:
+        """The mesh after the steps that serve under what was traced."""
         best, worse = surface, 0
         for number in range(self.settings.rounds):
             offsets = self.step(surface, start, shaped, held)
             normals = vertex_normals(surface.mesh.vertices, surface.mesh.faces)
             vertices = surface.mesh.vertices + offsets[:, None] * normals
             if number + 1 == self.settings.rounds and not (self.settings.looks_back or worse):
-                return mesh.replace(vertices=vertices)
-            moved = self.examine(mesh.replace(vertices=vertices), shaped, traced)
+                return surface.mesh.replace(vertices=vertices)
+            moved = self.examine(surface.mesh.replace(vertices=vertices), shaped, traced)
             if moved is None:
                 break
             moves = np.abs(offsets[moved.index])

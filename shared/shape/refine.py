@@ -14,7 +14,7 @@ from shared.geometry.mesh import Mesh, subdivide
 from shared.geometry.surface import Surface, TrackPoints
 from shared.imaging.views import Views
 from shared.rendering.precomputed_transfer import Sizes
-from shared.shape.gauss_newton import HELD, SHAPED, Reflectance, ShapeSettings, ShapeSolver, Traced
+from shared.shape.gauss_newton import HELD, SHAPED, Reflectance, ShapeSettings, ShapeSolver
 from shared.shape.silhouette import ContourSettings, fit_outline
 
 OUTLINED = ("forehead", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "lips", "chin", "jaw", "ears", "scalp")
@@ -27,11 +27,10 @@ MODEL_ERROR_MM = 2.0
 
 @dataclass(frozen=True, eq=False)
 class RefinedSurface:
-    """A surface with its mesh refined; traced: what was looked up for it, None where nothing was; stopped: vertices
-    that moved less than wanted, since the surface would have cut itself."""
+    """A surface with its mesh refined; stopped: vertices that moved less than wanted, since the surface would have cut
+    itself."""
 
     surface: Surface
-    traced: Traced | None
     stopped: int
 
 
@@ -72,15 +71,14 @@ def refine_shape(
     sizes: Sizes,
     settings: ShapeSettings,
     context: RunContext,
-    begun: RefinedSurface | None = None,
+    begun: Mesh | None = None,
 ) -> RefinedSurface:
-    """The surface with its mesh refined under a known light; begun: the same with fewer subdivisions, from where this
-    goes on."""
+    """The surface with its mesh refined under a known light; begun: its mesh as it was refined before, with as many
+    subdivisions or fewer, from where this goes on."""
     solver = ShapeSolver(views, surface.tracks, reflectance, appearance, sizes, settings, context)
-    so_far = None if begun is None else (begun.surface.mesh, begun.traced)
-    start, refined, traced = solver.refine(surface.mesh, surface.faces_of(SHAPED), surface.faces_of(HELD), so_far)
+    start, refined = solver.refine(surface.mesh, surface.faces_of(SHAPED), surface.faces_of(HELD), begun)
     placed = move_without_crossing(start.vertices, refined.vertices, refined.faces)
     stopped = int((np.abs(placed - refined.vertices).max(1) > 1e-6).sum())
     if stopped:
         context.note(f"shape: {stopped} vertices moved less than wanted, so that the surface does not cut itself")
-    return RefinedSurface(surface.with_mesh(refined.replace(vertices=placed)), traced and traced.kept(), stopped)
+    return RefinedSurface(surface.with_mesh(refined.replace(vertices=placed)), stopped)

@@ -249,7 +249,7 @@ def select_meshes(monkeypatch, qualities, **settings):
 
     def refine_shape(views, tracked, *, begun, **named):
         level = named["settings"].subdivisions
-        asked.append((level, begun and begun.surface.mesh))
+        asked.append((level, begun))
         surface = seen_surface(noisy(capture, qualities[1 + level]), f"level {level}")
         return SimpleNamespace(surface=surface, stopped=3 + level)
 

@@ -13,7 +13,7 @@ from toy_shape import FRAMES, LENS, ROUGHNESS, SIZE, SIZES, SPECULAR, shade, swi
 
 from shared.appearance.problem import AppearanceSettings
 from shared.contract.records import SOLVE
-from shared.geometry.mesh import Mesh, interpolate, normalised, tangent_frames, vertex_normals
+from shared.geometry.mesh import Mesh, interpolate, normalised, subdivide, tangent_frames, vertex_normals
 from shared.geometry.raycast import RayScene, camera_hits
 from shared.geometry.surface import TrackPoints
 from shared.geometry.transforms import projection_slope
@@ -180,7 +180,7 @@ def test_dent_is_found(toy):
     # The dent is as wide as what is otherwise laid to light and pose.
     solver = solver_of(toy, subdivisions=0, rounds=4, smoothness=3.0, equations=EquationSettings(smooth_mm=0.0))
     depth = toy.start.vertices[toy.start.faces].mean(1)[:, 2]
-    _, refined, _ = solver.refine(toy.start, depth > 20.0, depth < -40.0)
+    _, refined = solver.refine(toy.start, depth > 20.0, depth < -40.0)
     normals = vertex_normals(toy.start.vertices, toy.start.faces)
     wrong = ((toy.start.vertices - toy.truth.vertices) * normals).sum(1)
     left = ((refined.vertices - toy.truth.vertices) * normals).sum(1)
@@ -208,14 +208,50 @@ def test_the_shape_goes_on_past_one_worse_step_and_keeps_the_best(toy, monkeypat
         return int(np.rint(((mesh.vertices - toy.start.vertices) * normals).sum(1).mean()))
 
     def examine(mesh, shaped, traced):
-        value = judged[height(mesh)]
-        equations = SimpleNamespace(judged=value, fitted=value, held_out=value)
-        return ShapedSurface(mesh, np.arange(3), np.zeros((3, 2, 3)), equations)
+        return judged_surface(mesh, judged[height(mesh)])
 
     normals = vertex_normals(toy.start.vertices, toy.start.faces)
     monkeypatch.setattr(solver, "examine", examine)
     monkeypatch.setattr(solver, "step", lambda surface, *_: np.ones(len(surface.mesh.vertices)))
-    assert height(solver._refine_level(toy.start, toy.start.vertices, faces, ~faces, 0, None)) == kept
+    first = judged_surface(toy.start, judged[0])
+    assert height(solver._stepped(first, toy.start.vertices, faces, ~faces, None)) == kept
+
+
+def judged_surface(mesh, value):
+    """A surface whose held-out residual has this value."""
+    equations = SimpleNamespace(judged=value, fitted=value, held_out=value)
+    return ShapedSurface(mesh, np.arange(3), np.zeros((3, 2, 3)), equations)
+
+
+@pytest.mark.parametrize("judged, traced, stepped", [
+    ((1.0, 0.9, 0.8), 3, 3),
+    ((1.0, 0.995, 0.5), 2, 1),
+    ((1.0, 1.2, 0.5), 2, 1),
+])
+def test_the_given_mesh_is_traced_again_while_that_helps(toy, monkeypatch, judged, traced, stepped):
+    """Held-out frames judge the mesh, once traced anew, as the list says."""
+    solver, traces, steps = solver_of(toy, subdivisions=1, traces=3), [], []
+    monkeypatch.setattr(solver, "trace", lambda mesh, shaped: traces.append(len(mesh.faces)))
+    monkeypatch.setattr(solver, "examine", lambda mesh, *_: judged_surface(
+        mesh, judged[len(traces) - 1] if len(mesh.faces) == len(toy.start.faces) else 1.0))
+    monkeypatch.setattr(solver, "_stepped", lambda surface, *_: steps.append(1) or surface.mesh)
+    faces = np.ones(len(toy.start.faces), bool)
+    solver.refine(toy.start, faces, ~faces)
+    assert traces == [len(faces)] * traced + [4 * len(faces)] and len(steps) == stepped + 1
+
+
+@pytest.mark.parametrize("subdivisions, begun, levels", [(0, 0, [0]), (1, 0, [1]), (1, 1, [1]), (2, 1, [2])])
+def test_a_refined_mesh_goes_on_from_the_next_level_or_on_the_finest(toy, monkeypatch, subdivisions, begun, levels):
+    solver, asked, mesh = solver_of(toy, subdivisions=subdivisions), [], toy.start
+    for _ in range(begun):
+        mesh = subdivide(mesh)
+    raised = mesh.replace(vertices=mesh.vertices + 1.0)
+    monkeypatch.setattr(solver, "_refine_level", lambda mesh, start, *rest: asked.append(
+        (rest[2], float((mesh.vertices - start).mean()))) or mesh)
+    faces = np.ones(len(toy.start.faces), bool)
+    start, refined = solver.refine(toy.start, faces, ~faces, raised)
+    assert [level for level, _ in asked] == levels and asked[0][1] == pytest.approx(1.0, abs=0.01)
+    assert len(start.faces) == len(refined.faces) == len(faces) * 4**subdivisions
 
 
 @pytest.mark.parametrize("name, before, after", [("held_out", (0.03, 0.02), (0.01, 0.03)),
