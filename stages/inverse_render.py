@@ -66,7 +66,7 @@ PUBLISHED = ParameterGroup(
 
 STAGE = Stage(
     name="inverse_render",
-    version=23,
+    version=24,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -312,7 +312,8 @@ def check(job: Job) -> None:
             raise LimnError(f"{name} leaves [0, {highest:g}]: {image.min():.3f} .. {image.max():.3f}")
     if not (maps["confidence"] > 0.5).mean() > 0.01:
         raise InputError("the clip determines less than a hundredth of the map", where=str(job.subject.folder),
-                         hint="film with more light, sharper, or with a wider turn")
+                         hint="film with more light, sharper, with a wider turn, or with exposure and lamps that stay: "
+                              "frames that contradict each other determine little")
     record = read_json(job.out / "solve.json")
     others = {job.out / "clips" / clip["name"]: clip for clip in record.get("clips", ())[1:]}
     for folder, clip in ({job.out: record} | others).items():
