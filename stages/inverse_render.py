@@ -132,7 +132,7 @@ STAGE = Stage(
         Parameter("silhouette", bool, True, "Before the solve, move ears, skull and jaw so that the outline meets the "
                   "person mask's border."),
         Parameter("shape_subdivisions", int, 1, "Times that the mesh is subdivided for that.", "", 0, 2),
-        Parameter("shape_steps", int, 2, "Most steps of the shape per level.", "", 1, 20, former="shape_rounds"),
+        Parameter("shape_steps", int, 2, "Most steps of the shape before what it sees is traced again.", "", 1, 20, former="shape_rounds"),
         Parameter("shape_frames", int, 32, "Frames that the shape is solved from, spread evenly.", "frames", 3, 1000),
         Parameter("shape_smoothness", float, 19.0, "Lambda of the large steps: over how many edges, squared, the "
                   "surface moves together.", "", 0.0, 10000.0),
