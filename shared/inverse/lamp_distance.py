@@ -25,7 +25,7 @@ from shared.geometry.transforms import places_in_world
 from shared.imaging.views import Views
 from shared.inverse.lit_surface import LitSurface, report_to
 from shared.inverse.problem import InverseSettings
-from shared.rendering.direction_set import concentrated, split_directions, widest_spacing
+from shared.rendering.direction_set import PARTS, concentrated, split_directions, widest_spacing
 from shared.rendering.envmap import cube_directions, cube_solid_angles
 from shared.rendering.near_lamp import FAR, NearLamp, SeenLamp
 from shared.rendering.shading import light_along
@@ -44,6 +44,8 @@ LAMP_REACH, LAMP_SHARE = np.radians(30.0), 0.1
 LEAST_SHARE = 0.25
 """Of the light, along directions that a lamp shines from: of one that gives less, the distance hardly shows."""
 PASSING_POINTS = 64
+ACROSS = 3.0
+"""Directions over the radius of a lamp: a broad one needs none between those of an even set."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +73,12 @@ def find_lamp(
         return nothing
     moves = settings.appearance.light_moves(views.moves)
     nearest = main_lamp(solution.state.light, lit.coarse, views, moves, wanted or NEAREST_MM)
-    even = lit.precomputed.directions
-    directions = split_directions(even, passing(nearest, even, lit.coarse.points.positions, views, moves))
-    fine = LitSurface.of(lit.surface, views, settings, chart, context, directions=directions)
+
+    def lit_along(lamp: NearLamp) -> LitSurface:
+        directions = directions_towards(lamp, lit, views, moves)
+        return LitSurface.of(lit.surface, views, settings, chart, context, directions=directions)
+
+    fine = lit_along(nearest)
     start, record = fresh_highlights(solution, settings.appearance), {}
     if wanted is None:
         start, record = solve_distance(fine.coarse.some_points(POINTS), views, settings.appearance, start, moves,
@@ -83,6 +88,8 @@ def find_lamp(
     else:
         start = replace(start, lamp=nearest)
     lamp = main_lamp(start.state.light, lit.coarse, views, moves, start.lamp.distance_mm)
+    if wanted is None:
+        fine = lit_along(lamp)  # it passes over fewer directions than the nearest that was tried
     fine = fine.with_lamp(lamp, views, moves)
     solution = fit_appearance(fine.coarse, settings.appearance, report_to(context), start=start, least=STEPS,
                               shapes=wanted is not None)
@@ -147,6 +154,13 @@ def lit_by_lamp(capture: Capture, solution: Solution) -> bool:
     arriving = along.mean(2)
     share = arriving[concentrated(along)].sum(0) / np.maximum(arriving.sum(0), 1e-12)
     return bool(share.max() > LEAST_SHARE)
+
+
+def directions_towards(lamp: NearLamp, lit: LitSurface, views: Views, moves: str) -> np.ndarray:
+    """[J, 3]: the even set that a surface was lit along, split as finely as a lamp asks for where it passes."""
+    even = lit.precomputed.directions
+    parts = int(np.clip(round((ACROSS * widest_spacing(even) / lamp.radius) ** 2), 1, PARTS))
+    return split_directions(even, passing(lamp, even, lit.coarse.points.positions, views, moves), parts)
 
 
 def passing(lamp: NearLamp, directions: np.ndarray, positions: np.ndarray, views: Views, moves: str) -> np.ndarray:

@@ -40,12 +40,12 @@ def concentrated(light_along: np.ndarray) -> np.ndarray:
     return (arriving / np.maximum(arriving.sum(0), 1e-12)).max(1) > CONCENTRATED
 
 
-def split_directions(directions: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """A set [J', 3] like the even one [J, 3] with each of the chosen [J] bool in PARTS directions of its own cell,
-    whose solid angles sum to its own."""
-    if not chosen.any():
+def split_directions(directions: np.ndarray, chosen: np.ndarray, parts: int = PARTS) -> np.ndarray:
+    """A set [J', 3] like the even one [J, 3] with each of the chosen [J] bool in about so many directions of its own
+    cell, whose solid angles sum to its own."""
+    if parts == 1 or not chosen.any():
         return directions
-    finer = fibonacci_sphere(PARTS * len(directions))
+    finer = fibonacci_sphere(parts * len(directions))
     owner = cKDTree(directions).query(finer, workers=thread_count())[1]
     finer, owner = finer[chosen[owner]], owner[chosen[owner]]
     count = len(finer) + int((~chosen).sum())

@@ -1,6 +1,7 @@
 """How far away the main lamp stands, on synthetic captures."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from shared.contract.records import SOLVE
 from shared.errors import InputError
 from shared.geometry.mesh import normalised
 from shared.geometry.transforms import places_in_world
-from shared.inverse.lamp_distance import describe_lamp, lit_by_lamp, passing, solve_distance
+from shared.inverse.lamp_distance import describe_lamp, directions_towards, lit_by_lamp, passing, solve_distance
 from shared.inverse.parameters import read_lamp_distance
+from shared.rendering.direction_set import widest_spacing
 from shared.rendering.envmap import cube_directions, cube_solid_angles
 from shared.rendering.near_lamp import FAR, NearLamp, SeenLamp
 
@@ -96,6 +98,17 @@ def test_the_lamp_passes_along_few_directions(truth):
     position = seen.centres[3] + 400.0 * np.array(AXIS) @ seen.world_from_head[3]
     towards = normalised(position - truth.points.positions[10])
     assert near[(truth.directions @ towards).argmax()] and not near[(truth.directions @ towards).argmin()]
+
+
+@pytest.mark.parametrize("spacings, parts", [(0.5, 16), (1.5, 4), (3.0, 1)])
+def test_a_broad_lamp_needs_few_directions(truth, spacings, parts):
+    """A lamp's radius in spacings of the even set."""
+    lamp = lamp_at(600.0, spacings * widest_spacing(truth.directions))
+    lit = SimpleNamespace(precomputed=truth, coarse=truth)
+    passed = passing(lamp, truth.directions, truth.points.positions, Poses, "head")
+    towards = directions_towards(lamp, lit, Poses, "head")
+    expected = len(passed) + (parts - 1) * passed.sum()
+    assert len(towards) == (len(passed) if parts == 1 else pytest.approx(expected, rel=0.05))
 
 
 @pytest.mark.parametrize("text, expected", [("auto", None), ("far", FAR), ("600", 600.0)])
