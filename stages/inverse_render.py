@@ -132,7 +132,8 @@ STAGE = Stage(
         Parameter("silhouette", bool, True, "Before the solve, move ears, skull and jaw so that the outline meets the "
                   "person mask's border."),
         Parameter("shape_subdivisions", int, 1, "Times that the mesh is subdivided for that.", "", 0, 2),
-        Parameter("shape_steps", int, 2, "Most steps of the shape before what it sees is traced again.", "", 1, 20, former="shape_rounds"),
+        Parameter("shape_steps", int, 2, "Most steps of the shape before what it sees is traced again.", "", 1, 20,
+                  former="shape_rounds"),
         Parameter("shape_frames", int, 32, "Frames that the shape is solved from, spread evenly.", "frames", 3, 1000),
         Parameter("shape_smoothness", float, 19.0, "Lambda of the large steps: over how many edges, squared, the "
                   "surface moves together.", "", 0.0, 10000.0),
@@ -302,6 +303,7 @@ def run(job: Job) -> None:
 def check(job: Job) -> None:
     """Maps in range, light positive, part of the map determined, re-renders that are not black."""
     from shared.appearance.projection import SPECULAR_RANGE
+    from shared.inverse.solve import LEAST_SHARE
     from shared.io.arrays import read_json
     from shared.io.images import read_exr
 
@@ -310,11 +312,11 @@ def check(job: Job) -> None:
         highest = SPECULAR_RANGE[1] if name == "specular_intensity" else 1.0
         if not (image.min() >= 0.0 and image.max() <= highest):
             raise LimnError(f"{name} leaves [0, {highest:g}]: {image.min():.3f} .. {image.max():.3f}")
-    if not (maps["confidence"] > 0.5).mean() > 0.01:
-        raise InputError("the clip determines less than a hundredth of the map", where=str(job.subject.folder),
-                         hint="film with more light, sharper, with a wider turn, or with exposure and lamps that stay: "
-                              "frames that contradict each other determine little")
     record = read_json(job.out / "solve.json")
+    if not record["seen_share_of_texels"] > LEAST_SHARE:
+        raise InputError("the clip shows less than a hundredth of the map", where=str(job.subject.folder),
+                         hint="film with more light, sharper, with a wider turn, or with exposure and lamps that stay: "
+                              "frames that contradict each other show little")
     others = {job.out / "clips" / clip["name"]: clip for clip in record.get("clips", ())[1:]}
     for folder, clip in ({job.out: record} | others).items():
         light = read_exr(folder / "envmap.exr")

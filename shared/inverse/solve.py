@@ -40,6 +40,8 @@ from shared.inverse.shaping import shape_and_turn
 from shared.shape.gauss_newton import typical_edge
 from shared.shape.refine import meet_outline, surface_error
 
+LEAST_SHARE = 0.01
+"""Of the map: a clip that shows less of it gives no result, and one that determines less gives a warning."""
 HAIRLINE_MM = 10.0
 """Bends of the hairline shorter than this are the mesh's, not the hair's."""
 
@@ -216,6 +218,9 @@ def warnings_about(result: InverseResult) -> list[str]:
             f"frames held out fit worse ({solution.held_out:.4f}) than fitted ones ({solution.fitted:.4f}): "
             "poses or shape may be off, or the light changed"
         )
+    if (result.maps["confidence"] > 0.5).mean() < LEAST_SHARE:
+        found.append("the clip determines hardly any of the maps (see the confidence map): its frames contradict each "
+                     "other, or are too dark or blurred")
     if solution.held_out > 0.06:
         found.append(f"the model explains the clip poorly: residual {solution.held_out:.3f} of full scale")
     return found
