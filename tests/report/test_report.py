@@ -269,7 +269,7 @@ def test_gathering_of_warnings_and_left_out_frames(tmp_path):
         ("the background's brightness wanders by 5%: lock the exposure and keep the light still", "Lock the exposure"),
         ("frames held out fit worse (0.0337) than fitted ones (0.0194): poses or shape may be off", "Motion"),
         ("the model explains the clip poorly: residual 0.080 of full scale", "error maps"),
-        ("the clip determines hardly any of the maps (see the confidence map): its frames contradict each other", "lamps"),
+        ("the clip determines hardly any of the maps (see the confidence map): its frames", "lamps that stay"),
         ("the colours are HDR (hlg): they are converted to linear light", "contact sheet"),
         ("the colours are Display P3: they are converted to Rec.709", "contact sheet"),
         ("the images' values do not lie between 0 and 1: all are divided by 128", "contact sheet"),
