@@ -23,7 +23,7 @@ from shared.errors import LimnError
 
 STAGE = Stage(
     name="export_usd",
-    version=4,
+    version=5,
     help="The head as USD, glTF, OBJ and EXR, with a report to judge it by.",
     inputs=("sample_frames", "track_landmarks", "init_albedo", "inverse_render"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -178,6 +178,7 @@ def light_moves(job: Job, moves: str) -> str:
 
 def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, frames, solve: dict):
     """Writes views/novel_*.exr, views/relit_*.exr and the lights -> the ViewSet; None when switched off."""
+    from shared.rendering.near_lamp import NearLamp
     from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
     from shared.rendering.views import held_out_cameras, make_views
 
@@ -186,7 +187,7 @@ def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, frames
     cameras, moves = held_out_cameras(poses, frames.intrinsics, frames.size, solve), light_moves(job, frames.moves)
     views = make_views(
         mesh, maps, envmap, camera_from_head=poses["camera_from_head"], moves=moves, pixels=job.params.view_size,
-        held_out=cameras, progress=job.progress,
+        held_out=cameras, progress=job.progress, lamp=NearLamp.of_record(solve.get("lamp") or {}),
     )
     (job.out / "views").mkdir()
     pictures = {f"novel_{name}": picture for name, picture in views.novel.items()}

@@ -172,6 +172,10 @@ _LAMP = (
           unit="mm", optional=True),
     Field("lamp.position_mm", "Where it stands in world space, whose origin is the camera, or the head where the "
           "camera moves; absent where it is far.", shape="3", unit="mm", optional=True),
+    Field("lamp.centre_mm", "The place in world space from which the light, its lamp included, is seen as envmap.exr "
+          "has it; absent where it is far.", shape="3", unit="mm", optional=True),
+    Field("lamp.reach", "So far around its middle, seen from there, the light belongs to the lamp; absent where it is "
+          "far.", unit="radians", optional=True),
     Field("lamp.radius_mm", "Of a ball that is about as large as the lamp is seen; absent where it is far.", unit="mm",
           optional=True),
     Field("lamp.radiance", "Of that ball, so that as much light arrives; absent where it is far.", shape="3",

@@ -122,7 +122,9 @@ def describe_lamp(
     solid_angle = float((grey @ solid) ** 2 / (grey**2 @ solid))
     return record | {
         "distance_mm": round(float(np.linalg.norm(lamp.position - head)), 1),
-        "position_mm": lamp.position.round(1).tolist(),
+        "position_mm": lamp.position.round(2).tolist(),
+        "centre_mm": np.round(lamp.centre, 2).tolist(),
+        "reach": round(lamp.radius, 5),
         "radius_mm": round(lamp.distance_mm * (solid_angle / np.pi) ** 0.5, 2),
         "radiance": (solid @ own / solid_angle).round(4).tolist(),
     }

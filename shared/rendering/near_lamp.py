@@ -16,6 +16,7 @@ few, so that the rows cost less than the directions that a far lamp is split int
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -53,6 +54,15 @@ class NearLamp:
     centre: tuple[float, float, float]
     axis: tuple[float, float, float]
     radius: float
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, object]) -> NearLamp | None:
+        """The lamp that solve.json and run.json tell of (`lamp`); None where it is far."""
+        if "centre_mm" not in record:
+            return None
+        away = np.subtract(record["position_mm"], record["centre_mm"])
+        distance = float(np.linalg.norm(away))
+        return cls(distance, tuple(record["centre_mm"]), tuple((away / distance).tolist()), record["reach"])
 
     @property
     def position(self) -> np.ndarray:

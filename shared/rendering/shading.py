@@ -108,11 +108,17 @@ class VertexShading:
         return other
 
     def under(
-        self, light: np.ndarray, camera_from_head: np.ndarray, moves: str, light_index: np.ndarray | None = None
+        self,
+        light: np.ndarray,
+        camera_from_head: np.ndarray,
+        moves: str,
+        light_index: np.ndarray | None = None,
+        lamp: NearLamp | None = None,
     ) -> VertexShading:
-        """The same surface under another light, or under several, in other frames."""
+        """The same surface under another light, or under several, in other frames; the arguments are those of the
+        class."""
         other = copy(self)
-        other._light(light, camera_from_head, moves, light_index)
+        other._light(light, camera_from_head, moves, light_index, lamp)
         return other
 
     def _place(self, index, vertices, points, transfer) -> None:

@@ -20,6 +20,7 @@ from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texture import sample_bilinear
 from shared.rendering.envmap import cube_from_latlong, latlong_directions, latlong_lookup
+from shared.rendering.near_lamp import NearLamp
 from shared.rendering.precomputed_transfer import Sizes, precompute_transfer
 from shared.rendering.render import SurfaceMaps, render_frame, render_lights
 from shared.rendering.shading import DEEP, Material, VertexShading
@@ -59,14 +60,16 @@ def make_views(
     pixels: int,
     held_out: Mapping[int, ViewCamera],
     progress: Callable | None = None,
+    lamp: NearLamp | None = None,
 ) -> ViewSet:
     """All of them, pixels wide. maps and progress as for HeadViews; envmap [H, 2 H, 3], camera_from_head [F, 4, 4] and
-    moves of the clip; held_out: frames of the clip to re-render, with their cameras."""
+    moves of the clip; held_out: frames of the clip to re-render, with their cameras; lamp: of its light, where it
+    stands near: for those frames, while from elsewhere the head is seen under the light as its mean place has it."""
     around = [orbit_camera(mesh, *place, pixels) for place in NOVEL_VIEWS.values()]
     camera, front = orbit_camera(mesh, RELIT_YAW_DEG, 0.0, pixels), orbit_camera(mesh, 0.0, 0.0, pixels)
     views = HeadViews(mesh, maps, VIEW_SIZES, [*around, camera, front, *held_out.values()], progress)
     novel = views.render(clip_light(envmap, camera_from_head, moves), around)
-    again = views.render(envmap, list(held_out.values()), moves, fade=False) if held_out else []
+    again = views.render(envmap, list(held_out.values()), moves, fade=False, lamp=lamp) if held_out else []
     covered = share_out(len(ROUGHNESSES), lambda k: views.visibility(front, ROUGHNESSES[k]))
     return ViewSet(
         dict(zip(NOVEL_VIEWS, novel, strict=True)),
@@ -179,14 +182,20 @@ class HeadViews:
         return Material(albedo, specular, float(np.median(roughness)), roughness[self.index] if varies else None)
 
     def render(
-        self, light: np.ndarray, cameras: Sequence[ViewCamera], moves: str = "camera", fade: bool = True
+        self,
+        light: np.ndarray,
+        cameras: Sequence[ViewCamera],
+        moves: str = "camera",
+        fade: bool = True,
+        lamp: NearLamp | None = None,
     ) -> list[np.ndarray]:
-        """Lat-long radiance [H, 2 H, 3] -> a linear picture [h, w, 3] per camera, 0 beside the head.
+        """Lat-long radiance [H, 2 H, 3] -> a linear picture [h, w, 3] per camera, 0 beside the head; lamp: of the
+        light, where it stands near the cameras' heads.
 
         moves "camera": the light is given in head space; "head": in the world of geometry.world_from_head. fade: pixels
         that the head covers in part are darker by the rest; else they show the mean of the part.
         """
-        return self._pictures(self._shading([light], cameras, moves), cameras, fade)
+        return self._pictures(self._shading([light], cameras, moves, lamp), cameras, fade)
 
     def relit(self, lights: Sequence[np.ndarray], camera: ViewCamera) -> list[np.ndarray]:
         """A picture, as of render, for each of several lights, given in head space."""
@@ -206,7 +215,9 @@ class HeadViews:
             pictures.append(picture * covered[..., None] if fade else picture)
         return pictures
 
-    def _shading(self, lights: Sequence[np.ndarray], cameras: Sequence[ViewCamera], moves: str) -> VertexShading:
+    def _shading(
+        self, lights: Sequence[np.ndarray], cameras: Sequence[ViewCamera], moves: str, lamp: NearLamp | None = None
+    ) -> VertexShading:
         """Under one light for all cameras, or one for each; what no light changes is made once."""
         poses = np.stack([camera.camera_from_head for camera in cameras])
         cubes = [np.maximum(cube_from_latlong(light, self.light_resolution), 0.0) for light in lights]
@@ -226,9 +237,11 @@ class HeadViews:
                 key_step=0.0,
                 deep=self.deep,
                 light_index=light_index,
+                lamp=lamp,
+                node_points=self.precomputed.nodes.points,
             )
             return self._lit
-        return self._lit.under(light, poses, moves, light_index)
+        return self._lit.under(light, poses, moves, light_index, lamp)
 
     def coverage(self, camera: ViewCamera) -> np.ndarray:
         """[h, w] in 0 .. 1: how much of each pixel the head covers, as render counts it."""

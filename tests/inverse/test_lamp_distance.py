@@ -71,6 +71,11 @@ def test_the_distance_of_a_lamp_is_found(truth, distance):
     said = describe_lamp(found.lamp, found.state.light, record, Poses, "head")
     assert said["distance_mm"] == pytest.approx(distance, rel=0.15)
     assert field_faults(said, below(SOLVE, "lamp")) == []
+    told = NearLamp.of_record(said)
+    np.testing.assert_allclose(told.position, found.lamp.position, atol=0.01)
+    np.testing.assert_allclose((*told.centre, *told.axis), (*found.lamp.centre, *found.lamp.axis), atol=0.01)
+    assert told.radius == pytest.approx(found.lamp.radius, abs=1e-5)
+    assert NearLamp.of_record({"near": False}) is None
     truth_mm = lamp_at(distance).position
     assert np.linalg.norm(np.subtract(said["position_mm"], truth_mm)) < 0.2 * distance
 

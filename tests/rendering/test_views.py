@@ -10,6 +10,7 @@ from shared.io.arrays import load_arrays, read_json
 from shared.io.images import read_exr
 from shared.io.meshes import load_mesh
 from shared.rendering.brdf import hemispherical_albedo
+from shared.rendering.near_lamp import NearLamp
 from shared.rendering.precomputed_transfer import Sizes
 from shared.rendering.studio_lights import HEIGHT, STUDIO_LIGHTS, facing_irradiance, lamp, studio_light
 from shared.rendering.view_set import NOVEL_VIEWS
@@ -63,6 +64,18 @@ def test_lamps_light_the_side_they_stand_on():
     half = PIXELS // 2
     assert left[:, :half].sum() > 5 * left[:, half:].sum() and right[:, half:].sum() > 5 * right[:, :half].sum()
     assert above[:half].sum() > 5 * above[half:].sum()
+
+
+def test_a_near_lamp_lights_by_the_inverse_square():
+    """Straight ahead of a ball, where the lamp stands nearer by the radius than it does to the middle, and at its side.
+    """
+    views, camera = HeadViews(ball(4), ball_maps(0.0), SIZES), orbit_camera(ball(), 0.0, 0.0, PIXELS)
+    light, distance = lamp(0, 0, (1, 1, 1), 6), 400.0
+    near = NearLamp(distance, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.6)
+    far, seen = (views.render(light, [camera], lamp=one)[0][PIXELS // 2, :, 0] for one in (None, near))
+    ahead = seen[PIXELS // 2] / far[PIXELS // 2]
+    assert ahead == pytest.approx((distance / (distance - RADIUS)) ** 2, rel=0.05)
+    assert seen[PIXELS // 2 + 18] / far[PIXELS // 2 + 18] < 0.9 * ahead
 
 
 def test_lights_side_by_side_give_the_pictures_of_each_alone():

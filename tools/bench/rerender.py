@@ -60,7 +60,7 @@ class SolvedClip:
     def compared(self) -> list[HeldOutFrame]:
         """Every held-out frame beside its re-render under the clip's light."""
         cameras = [item.camera for item in self.held_out]
-        renders = self.views.render(self.asset.envmap, cameras, self.asset.moves, fade=False)
+        renders = self.views.render(self.asset.envmap, cameras, self.asset.moves, fade=False, lamp=self.asset.lamp)
         return [
             HeldOutFrame(item.frame, self.frames.read_linear(item.place), render, self.regions(item))
             for item, render in zip(self.held_out, renders, strict=True)

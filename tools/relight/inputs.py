@@ -14,6 +14,7 @@ from shared.geometry.transforms import WORLD_FROM_CAMERA, rotation_from_vector
 from shared.io.arrays import load_arrays, read_json
 from shared.io.exr_picture import read_rec709
 from shared.io.meshes import load_mesh, read_obj
+from shared.rendering.near_lamp import NearLamp
 from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
 
 MAPS = ("diffuse_albedo", "specular_intensity", "roughness")
@@ -26,7 +27,8 @@ _LARGEST_LIGHT = 8192
 @dataclass(frozen=True)
 class Asset:
     """What is to be lit: mesh (mm, y up, facing +z) and maps by name; of a result also its light, poses [F, 4, 4] with
-    frame_index [F], intrinsics [3, 3] of the source frame, and what moved in the clip."""
+    frame_index [F], intrinsics [3, 3] of the source frame, what moved in the clip, and its light's lamp where that
+    stands near."""
 
     mesh: Mesh
     maps: dict[str, np.ndarray]
@@ -35,6 +37,7 @@ class Asset:
     frame_index: np.ndarray | None = None
     intrinsics: np.ndarray | None = None
     moves: str = "head"
+    lamp: NearLamp | None = None
 
 
 def open_asset(path: Path, albedo: tuple[float, ...], specular: float, roughness: float) -> Asset:
@@ -79,7 +82,7 @@ def _open_result(path: Path) -> Asset:
         arrays["camera_from_head"].astype(np.float64),
         arrays["frame_index"],
         arrays["intrinsics"].astype(np.float64),
-        _moves(folder),
+        *_light_of_clip(folder),
     )
 
 
@@ -91,11 +94,14 @@ def _read_map(folder: Path, name: str) -> np.ndarray:
     return read_rec709(path)
 
 
-def _moves(folder: Path) -> str:
+def _light_of_clip(folder: Path) -> tuple[str, NearLamp | None]:
+    """What moved against the light, and the light's lamp where that stands near."""
     for name in ("run.json", "solve.json"):
         if (folder / name).is_file():
-            model = read_json(folder / name).get("model", {})
-            return "camera" if isinstance(model, dict) and model.get("moves") == "camera" else "head"
+            record = read_json(folder / name)
+            model, lamp = record.get("model", {}), record.get("lamp") or {}
+            moves = "camera" if isinstance(model, dict) and model.get("moves") == "camera" else "head"
+            return moves, NearLamp.of_record(lamp)
     raise InputError("neither run.json nor solve.json", where=str(folder), hint="name a complete result")
 
 
