@@ -13,6 +13,9 @@ from shared.io.images import read_exr, read_png
 from tools.scoring import measures
 from tools.scoring.buffers import BufferRenderer as BufferViewer
 
+SCALAR_ERRORS = "rmse", "correlation", "mean_gt", "mean_result"
+"""Of specular intensity and roughness where the result is confident; NaN where it nowhere is."""
+
 
 def map_errors(
     subject: Path, inputs: ClipInputs, index: np.ndarray, mesh: Mesh, maps: dict[str, np.ndarray]
@@ -42,8 +45,8 @@ def map_errors(
     result["confident_share"] = float(is_confident.mean())
     for name in ("specular", "roughness"):
         truth, found = (side[is_confident, 0] for side in joined[name])
-        errors = measures.scalar_errors(truth, found)
-        result |= {f"{name}_{key}": errors[key] for key in ("rmse", "correlation", "mean_gt", "mean_result")}
+        errors = measures.scalar_errors(truth, found) if is_confident.any() else dict.fromkeys(SCALAR_ERRORS, np.nan)
+        result |= {f"{name}_{key}": errors[key] for key in SCALAR_ERRORS}
     return result
 
 
