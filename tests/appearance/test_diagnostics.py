@@ -1,5 +1,6 @@
 """Signs of causes that the model cannot follow, on the egg whose light and albedo are known."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -121,12 +122,12 @@ def test_an_unlikely_colour_is_one_that_neither_skin_nor_light_has():
     assert unlikely_colour(skin * [0.3, 1.0, 2.0], 0.6) < unlikely_colour(skin * [0.3, 1.0, 2.0], 0.15)
 
 
-def test_a_clip_that_determines_nothing_is_refused(tmp_path):
+def test_a_clip_that_shows_nothing_is_refused(tmp_path):
     """As of a face in the dark: the clip's fault, not a failure of ours."""
     (tmp_path / "maps").mkdir()
     for name in ("diffuse_albedo", "specular_intensity", "roughness", "normal", "confidence"):
-        value = 0.02 if name == "confidence" else 0.5
-        image = np.full((16, 16, 3) if name in ("diffuse_albedo", "normal") else (16, 16), value, np.float32)
+        image = np.full((16, 16, 3) if name in ("diffuse_albedo", "normal") else (16, 16), 0.5, np.float32)
         write_exr(tmp_path / "maps" / f"{name}.exr", image, colour_space="data")
-    with pytest.raises(InputError, match="film with more light"):
+    (tmp_path / "solve.json").write_text(json.dumps({"seen_share_of_texels": 0.004}), encoding="utf-8")
+    with pytest.raises(InputError, match="shows less than a hundredth.*film with more light"):
         check(SimpleNamespace(out=tmp_path, subject=SimpleNamespace(folder=tmp_path)))
