@@ -42,6 +42,10 @@ LANDMARK_FRAMES = 15
 FOLLOW_TEXELS = 3.0
 """Half of what the coarse pass searches; landmarks jitter by less."""
 
+CLEARLY_MORE = 1.1
+"""So many times the tracks must agree with the other place of a frame before its landmarks are not believed: between
+two wrong ones, or where the mean texture is poor, it is chance."""
+
 LEAST_ROTATION_DEG = 3.0
 """Between the views that lie farthest apart: a still face has hundredths, the smallest turn that gives a result that is
 right 13."""
@@ -229,7 +233,7 @@ def _coarse_pass(clip, model, fit, poses, between, known, progress) -> Adjusted:
         others, _, elsewhere = track_texture(clip, model, fit.vertices, between, known, doubtful, settings, progress)
         agree = [agreement(own, points, way, clip.intrinsics, settings.texel_px)
                  for own, way in ((tracks, found), (others, elsewhere))]
-        better = doubtful & (agree[1] > agree[0])
+        better = doubtful & clearly_more(*agree)
         tracks.pixels[better], tracks.whitening[better] = others.pixels[better], others.whitening[better]
         found[better] = elsewhere[better]
     return solve_texture(clip, tracks, points, found, settings.prior_mm)
@@ -242,6 +246,11 @@ def agreement(
     scale_px; points [N, 3] mm."""
     off = np.linalg.norm(project(points, poses, intrinsics)[0] - tracks.pixels, axis=2)
     return np.nansum(1.0 / (1.0 + np.square(off / scale_px)), axis=1)
+
+
+def clearly_more(own: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """[F] bool: frames in which by far more tracks agree with the other pose; own, other [F]: see agreement."""
+    return other > CLEARLY_MORE * own
 
 
 def _fine_pass(clip, model, fit, poses, reliable, settings, progress) -> tuple[Adjusted, tuple[Tracks, np.ndarray]]:

@@ -22,6 +22,9 @@ CRUSHED_CODE, CLIPPED_CODE = 8, 250
 GREEN_AND_BLUE = 0.84, 0.16
 """Their shares of brightness where red is left out."""
 
+SPOILT_SHARE = 0.05
+"""Grey contrast with so much clipped red in its window shows the border of what is clipped, which the light moves."""
+
 
 def local_contrast(grey: np.ndarray, sigma_px: float, spread_px: float, floor: float) -> np.ndarray:
     """Log image minus its local mean over its local spread: [H, W] uint8 -> [H, W] uint8, 128 is the mean.
@@ -91,8 +94,9 @@ def face_width(landmarks_px: np.ndarray) -> float:
 class GreyFrame:
     """What the pictures of a frame are made of: grey [H, W] uint8, and 1 where a pixel says nothing, [H, W] uint8.
 
-    Skin's red burns out first, and with it what could be tracked. Where red alone is clipped green and blue stand in:
-    cool [H, W] uint8 is their mixture, red_clipped [H, W] bool where it serves; None where no pixel needs it.
+    Skin's red burns out first, and with it what could be tracked. Where red alone is clipped, and as far around as
+    a window reaches, green and blue stand in: cool [H, W] uint8 is their mixture, red_clipped [H, W] bool where red
+    alone is clipped; None where it is nowhere.
     """
 
     grey: np.ndarray
@@ -123,8 +127,10 @@ class GreyFrame:
         return self._contrast(DETAIL_SIGMA_PX, 2.25 * DETAIL_SIGMA_PX, 0.05)
 
     def _contrast(self, sigma_px: float, spread_px: float, floor: float) -> np.ndarray:
-        """Local contrast, of green and blue where red is clipped."""
+        """Local contrast, of green and blue where clipped red reaches into the window."""
         picture = local_contrast(self.grey, sigma_px, spread_px, floor)
         if self.cool is not None:
-            np.copyto(picture, local_contrast(self.cool, sigma_px, spread_px, floor), where=self.red_clipped)
+            clipped_share = cv2.GaussianBlur(self.red_clipped.astype(np.float32), (0, 0), spread_px)
+            spoilt = self.red_clipped | (clipped_share > SPOILT_SHARE)
+            np.copyto(picture, local_contrast(self.cool, sigma_px, spread_px, floor), where=spoilt)
         return picture

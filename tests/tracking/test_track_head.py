@@ -17,7 +17,7 @@ from shared.tracking import track_head
 from shared.tracking.bundle import Tracks
 from shared.tracking.first_poses import interpolate_poses
 from shared.tracking.pose_uncertainty import rotations_apart
-from shared.tracking.track_head import agreement, carried_poses, follow_landmarks, refuse_still_head
+from shared.tracking.track_head import agreement, carried_poses, clearly_more, follow_landmarks, refuse_still_head
 from shared.tracking.tracked_clip import TrackedClip
 from stages import sample_frames, track_landmarks
 
@@ -161,3 +161,8 @@ def test_tracks_tell_which_of_two_poses_a_frame_has():
     pixels[3, 100:] = np.nan
     found = agreement(Tracks.of_equal_noise(pixels, 1.0), named, poses, INTRINSICS, 1.0)
     np.testing.assert_allclose(found, [468, 468 / 1.25, 468 / 2501, 100], rtol=1e-6)
+
+
+def test_a_frame_whose_tracks_hardly_tell_stays_where_its_landmarks_have_it():
+    """Counts as they were under landmarks that slide (the other place 13 degrees off) and under a hard lamp (right)."""
+    assert list(clearly_more(np.array([215.3, 329.3]), np.array([216.2, 741.6]))) == [False, True]

@@ -8,7 +8,7 @@ from toy_plane import LENS, PLANE, SIZE, plane_texture, see_plane
 from shared.geometry.mesh import vertex_normals
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import project, rigid
-from shared.tracking.tracked_clip import GreyFrame, local_contrast, unusable_pixels
+from shared.tracking.tracked_clip import DETAIL_SIGMA_PX, GreyFrame, local_contrast, unusable_pixels
 from shared.tracking.tracks import (
     dense_tracks,
     grid_from_landmarks,
@@ -105,6 +105,17 @@ def test_green_and_blue_stand_in_where_red_alone_is_clipped():
     assert unclipped.cool is None and unclipped.red_clipped is None
     for found, expected in zip(frame.contrast(200.0), unclipped.contrast(200.0), strict=True):
         assert np.corrcoef(found.ravel().astype(float), expected.ravel().astype(float))[0, 1] > 0.95
+
+
+def test_the_border_of_clipped_red_leaves_no_trace_in_the_contrast():
+    skin = np.stack([np.full((128, 128), 220.0), 0.8 * texture(128), 0.5 * texture(128)], axis=2).clip(0, 255)
+    skin[:, 64:, 0] = 255
+    frame = GreyFrame.of(np.uint8(skin), np.zeros((128, 128), bool))
+    cool = local_contrast(frame.cool, DETAIL_SIGMA_PX, 2.25 * DETAIL_SIGMA_PX, 0.05)
+    grey = local_contrast(frame.grey, DETAIL_SIGMA_PX, 2.25 * DETAIL_SIGMA_PX, 0.05)
+    detail = frame.detail()
+    assert frame.red_clipped[:, 62:].all() and not frame.red_clipped[:, :62].any()
+    assert (detail[:, 59:] == cool[:, 59:]).all() and (detail[:, :52] == grey[:, :52]).all()
 
 
 def test_a_pixel_of_two_clipped_channels_or_of_the_background_says_nothing():
