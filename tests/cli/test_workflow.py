@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from toy_runs import REPOSITORY, copy_pipeline, limn, limn_process, make_subject, outputs_of, tree, wait_for
 
+from tools.cli.engine import interrupted_later
 from tools.limn import main
 
 
@@ -228,3 +229,13 @@ def test_new_subject(tmp_path, capsys):
         error = capsys.readouterr().err
         assert error.count("\n") == 1 and hint in error and ".tmp-" not in error
     assert tree(tmp_path) == before
+
+
+def test_an_interrupt_waits_until_what_it_would_break_is_through():
+    went = []
+    with pytest.raises(KeyboardInterrupt):
+        with interrupted_later():
+            os.kill(os.getpid(), signal.SIGINT)
+            went.append("on")
+        went.append("farther")
+    assert went == ["on"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -147,7 +147,8 @@ def run_engine(home: Path, cases: Sequence[SubjectCase], settings: EngineSetting
             watch.poll()
             if not is_called and watch.has_begun:
                 is_called = True
-                meanwhile()
+                with interrupted_later():
+                    meanwhile()
         watch.poll()
         return True
     except KeyboardInterrupt:
@@ -159,6 +160,26 @@ def run_engine(home: Path, cases: Sequence[SubjectCase], settings: EngineSetting
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(started.pid, signal.SIGKILL)
             started.wait()
+
+
+@contextlib.contextmanager
+def interrupted_later() -> Iterator[None]:
+    """Keeps what would interrupt the block until it is through; KeyboardInterrupt then.
+
+    Libraries that are being loaded run Python from C. An interrupt that leaves such code marks the whole process as
+    ended by SIGINT, even where it is caught later (unhandled_keyboard_interrupt in CPython's Python/pythonrun.c).
+    """
+    came: list[int] = []
+    before = {number: signal.signal(number, lambda number, _: came.append(number))
+              for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+              if callable(signal.getsignal(number))}  # one that is ignored, or ends the process at once, does so still
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if came:
+        raise KeyboardInterrupt
 
 
 def _has_ended(process: subprocess.Popen, wait_s: float) -> bool:
