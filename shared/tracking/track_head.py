@@ -231,9 +231,9 @@ def _coarse_pass(clip, model, fit, poses, between, known, progress) -> Adjusted:
     tracks, points, found = track_texture(clip, model, fit.vertices, poses, known, tracked, settings, progress)
     if doubtful.any():
         others, _, elsewhere = track_texture(clip, model, fit.vertices, between, known, doubtful, settings, progress)
-        agree = [agreement(own, points, way, clip.intrinsics, settings.texel_px)
-                 for own, way in ((tracks, found), (others, elsewhere))]
-        better = doubtful & clearly_more(*agree)
+        agree = agreement(tracks, points, found, clip.intrinsics, settings.texel_px)
+        others_agree = agreement(others, points, elsewhere, clip.intrinsics, settings.texel_px)
+        better = doubtful & clearly_more(own=agree, other=others_agree)
         tracks.pixels[better], tracks.whitening[better] = others.pixels[better], others.whitening[better]
         found[better] = elsewhere[better]
     return solve_texture(clip, tracks, points, found, settings.prior_mm)

@@ -170,7 +170,7 @@ def interrupted_later() -> Iterator[None]:
     ended by SIGINT, even where it is caught later (unhandled_keyboard_interrupt in CPython's Python/pythonrun.c).
     """
     came: list[int] = []
-    before = {number: signal.signal(number, lambda number, _: came.append(number))
+    before = {number: signal.signal(number, lambda caught, _frame: came.append(caught))
               for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
               if callable(signal.getsignal(number))}  # one that is ignored, or ends the process at once, does so still
     try:
