@@ -231,11 +231,30 @@ def test_new_subject(tmp_path, capsys):
     assert tree(tmp_path) == before
 
 
-def test_an_interrupt_waits_until_what_it_would_break_is_through():
+@pytest.fixture
+def handled_sigterm():
+    """A handler of SIGTERM that ends what runs; SIGINT would depend on how the tests were started."""
+
+    def end(_number, _frame):
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, end)
+    yield end
+    signal.signal(signal.SIGTERM, before)
+
+
+def test_an_interrupt_waits_until_what_it_would_break_is_through(handled_sigterm):
     went = []
     with pytest.raises(KeyboardInterrupt):
         with interrupted_later():
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGTERM)
             went.append("on")
         went.append("farther")
-    assert went == ["on"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert went == ["on"] and signal.getsignal(signal.SIGTERM) is handled_sigterm
+
+
+def test_what_is_ignored_does_not_interrupt_later_either(handled_sigterm):
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    with interrupted_later():
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
