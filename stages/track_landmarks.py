@@ -5,7 +5,7 @@ Reads    sample_frames: the cropped frames and their intrinsics. The subject's o
 Writes   poses.npz, mesh.npz, landmarks.npz, tracks.npz, tracking.json, overlay.png, curves.png, residuals.png.
 Method   468 landmarks a frame start the poses, dense flow and then tracks against the clip's mean texture, adjusted as
          one rigid body, hold them still; the head model is fitted to the tracks and then bent to them freely. Scale is
-         the head model's prior.
+         the head model's prior. Frames of another expression than most are left out.
 Fails    no landmarks in three frames; skin that cannot be tracked (too small, blurred, or not the same head); a head
          that does not turn (a poster, too).
 """
@@ -20,7 +20,7 @@ from shared.contract.records import LANDMARKS, MESH, TRACKED_POSES, TRACKING, TR
 
 STAGE = Stage(
     name="track_landmarks",
-    version=11,
+    version=12,
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
     given=("landmarks", "poses"),
@@ -150,13 +150,15 @@ def excluded_frames(frames, used: np.ndarray, presence: np.ndarray, reasons: lis
     return excluded
 
 
-def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[dict]) -> dict:
-    """tracking.json; its warnings also go to the log. fits [F] bool: frames that got a pose."""
+def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[dict], common) -> dict:
+    """tracking.json; its warnings also go to the log. fits [F] bool: frames that got a pose; common: their
+    expression."""
     from shared.geometry.transforms import rotation_range_deg
     from shared.tracking.track_quality import rotation_deviation_deg, warnings_of
 
     lips = track.fit.vertices[np.unique(model.faces[model.segment("lips")])]
     warnings = warnings_of(track, fits, frames.count, frames.focal_known, lips)
+    warnings += filter(None, [common.warning()])
     for warning in warnings:
         job.warn(warning)
     error = track.error_px[fits]
@@ -199,13 +201,19 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
     from shared.io.meshes import save_mesh
     from shared.report.tracking_pictures import overlay_strip, pose_curves, residual_map
     from shared.tracking.bundle import zoomed
+    from shared.tracking.expression import common_expression
     from shared.tracking.first_poses import choose_references
     from shared.tracking.track_quality import frames_that_fit
 
     fits, reasons = frames_that_fit(track, job.params.outlier_factor)
-    kept, poses, covariance = used[fits], track.camera_from_head[fits], track.covariance[fits]
     gain = track.focal_gain if track.focal_solved else 1.0
     lens = zoomed(frames.intrinsics, gain)
+    common = common_expression(
+        model, track.fit.vertices, track.camera_from_head, lens, landmarks_px[used], fits
+    )
+    fits = fits & common.shown
+    reasons = [reason or common.reason(k) for k, reason in enumerate(reasons)]
+    kept, poses, covariance = used[fits], track.camera_from_head[fits], track.covariance[fits]
     save_arrays(
         job.out / "poses.npz",
         camera_from_head=poses,
@@ -225,7 +233,7 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
     residual = np.nanmedian(track.error_px[fits], axis=0)
     save_arrays(job.out / "tracks.npz", points_head=track.points_head, residual_px=residual, sigma_mm=track.sigma_mm)
     excluded = excluded_frames(frames, used, presence, reasons)
-    write_json(job.out / "tracking.json", summarise(job, frames, model, track, fits, excluded))
+    write_json(job.out / "tracking.json", summarise(job, frames, model, track, fits, excluded, common))
     chosen = choose_references(poses, 5)
     pictures = [eight_bit(frames.read_codes(i)) for i in kept[chosen]]
     write_png(job.out / "overlay.png", overlay_strip(pictures, mesh, poses[chosen], lens, landmarks_px[kept[chosen]]))

@@ -61,6 +61,12 @@ class HeadModel:
         """[F] bool: does a face belong to one of the named segments? ValueError for an unknown name."""
         return np.isin(self.face_segment, [self.segment_names.index(name) for name in names])
 
+    @property
+    def landmark_segments(self) -> np.ndarray:
+        """[468] the name of the segment that each landmark lies on, "" where the model has none."""
+        names = np.array(self.segment_names)[self.face_segment[self.landmark_face]]
+        return np.where(self.landmark_face >= 0, names, "")
+
     def shape(self, identity: np.ndarray | None = None, expression: np.ndarray | None = None) -> np.ndarray:
         """[V, 3] float64 vertices in mm. identity [<=I] standard deviations, expression [<=E] activations;
         None: 0.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -49,6 +49,15 @@ def coarse_pass(face_width_px: float) -> TrackingPass:
     """The pass that takes in frames whose pose is only interpolated; a large face is seen in larger texels."""
     texel_px = float(np.clip(round(face_width_px / COARSE_FACE_TEXELS), 1.0, 4.0))
     return TrackingPass(texel_px, False, 1500, Windows(sigma=4.0, search=6.0, steps=4), 10.0)
+
+
+COARSER = ((8.0, 3), (4.0, 2), (2.0, 2))
+"""How much larger than the coarse pass's the texels are in which guessed frames are looked for first, and how often:
+windows of half the face, then of ever less."""
+AFAR_SPREAD = 15.0
+"""Code values, a third of what contrast varies by: where all frames agree to less, one that is off is all outliers."""
+LEAST_FACE_TEXELS = 30.0
+"""Windows as wide as the face tell nothing of its turn."""
 
 
 class AtlasTracker:
@@ -139,14 +148,55 @@ def track_texture(
 
     poses [F, 4, 4] of the fitted head. -> tracks, their points [N, 3] on the head and the poses found.
     """
-    mesh = Mesh(vertices, model.faces, model.uvs, model.face_uvs)
-    tracker = AtlasTracker(clip, mesh, trackable_faces(model), float(np.median(poses[known, 2, 3])), settings)
+    tracker = _tracker_on_head(clip, model, vertices, poses[known], settings)
     texture = tracker.mean(np.nonzero(known)[0], poses, progress)
     tracks = tracker.track(texture, np.nonzero(tracked)[0], poses, progress)
     points = tracker.atlas.points(vertices)
-    for loss in () if clip.hold_poses else (15.0, 5.0):
-        poses, _ = resect(tracks, poses, points, clip.intrinsics, loss_scale=loss * LOSS)
-    return tracks, points, poses
+    return tracks, points, poses if clip.hold_poses else drawn_to(tracks, points, poses, clip.intrinsics)
+
+
+def look_from_afar(
+    clip: TrackedClip,
+    model: HeadModel,
+    vertices: np.ndarray,
+    starts: Sequence[np.ndarray],
+    known: np.ndarray,
+    guessed: np.ndarray,
+    settings: TrackingPass,
+    face_width_px: float,
+    progress: Callable,
+) -> list[np.ndarray]:
+    """Poses [F, 4, 4] like each of the starts, in which the guessed frames [F] bool lie where the mean of the known
+    ones [F] bool is found in ever smaller texels, down to twice those of the settings. vertices [V, 3] mm.
+
+    A window that misses by half its width sees nothing that it knows, takes all of it for highlights and stays where
+    it is: tracks then agree with a pose that is off by several pixels.
+    """
+    starts, wanted = list(starts), np.nonzero(guessed)[0]
+    for larger, rounds in COARSER:
+        if face_width_px < LEAST_FACE_TEXELS * larger * settings.texel_px:
+            continue
+        windows = replace(settings.windows, least_spread=AFAR_SPREAD)
+        coarser = replace(settings, texel_px=larger * settings.texel_px, windows=windows)
+        tracker = _tracker_on_head(clip, model, vertices, starts[0][known], coarser)
+        texture, points = tracker.mean(np.nonzero(known)[0], starts[0], progress), tracker.atlas.points(vertices)
+        for k, poses in enumerate(starts):
+            for _ in range(rounds):
+                poses = drawn_to(tracker.track(texture, wanted, poses, progress), points, poses, clip.intrinsics)
+            starts[k] = poses
+    return starts
+
+
+def drawn_to(tracks: Tracks, points: np.ndarray, poses: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Each frame's pose [F, 4, 4] by its own tracks of points [N, 3] mm, from far off at first."""
+    for loss in (15.0, 5.0):
+        poses, _ = resect(tracks, poses, points, intrinsics, loss_scale=loss * LOSS)
+    return poses
+
+
+def _tracker_on_head(clip, model, vertices, poses, settings) -> AtlasTracker:
+    mesh = Mesh(vertices, model.faces, model.uvs, model.face_uvs)
+    return AtlasTracker(clip, mesh, trackable_faces(model), float(np.median(poses[:, 2, 3])), settings)
 
 
 def solve_texture(

@@ -72,12 +72,14 @@ def _moments(pairs, reweigh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Windows:
-    """sigma of the windows and largest believed error, in texels; steps; floor: the least noise of a track, px."""
+    """sigma of the windows and largest believed error, in texels; steps; floor: the least noise of a track, px;
+    least_spread: code values below which no texel's spread counts, for frames that are off and so differ everywhere."""
 
     sigma: float = 5.0
     search: float = 6.0
     steps: int = 3
     floor_px: float = 0.03
+    least_spread: float = LEAST_SPREAD
 
 
 def track_frame(
@@ -96,11 +98,12 @@ def track_frame(
     mean, spread = texture.mean.ravel().take(texels), texture.spread.ravel().take(texels)
     gx, gy = (part.ravel().take(texels) for part in texture.gradient)
     offset = np.zeros((*placed.shown.shape, 2), np.float32)
+    scale = OUTLIER_SPREADS * np.maximum(spread, np.float32(windows.least_spread))
     windowed, offsets = _Windowed(placed.shown.shape, texels, windows), offset.reshape(-1, 2)
     for step in range(windows.steps):
         image = lookups.sample(picture, placed.layout, offset if step else None)
         difference = image.astype(np.float32) - mean
-        weight = cauchy_weight(difference, OUTLIER_SPREADS * spread)
+        weight = cauchy_weight(difference, scale)
         wx, wy = weight * gx, weight * gy
         normal = windowed.means(wx * gx, wx * gy, wy * gy, wx * difference)
         pull = windowed.means(wy * difference)

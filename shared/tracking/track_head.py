@@ -32,7 +32,7 @@ from shared.tracking.fit_head import FitWeights, HeadFit, fit_codes, landmarks_o
 from shared.tracking.fit_surface import ThinPlate, fit_surface
 from shared.tracking.head_model import HeadModel
 from shared.tracking.pose_uncertainty import estimate_uncertainty, focal_elsewhere
-from shared.tracking.texture_tracking import TrackingPass, coarse_pass, solve_texture, track_texture
+from shared.tracking.texture_tracking import TrackingPass, coarse_pass, look_from_afar, solve_texture, track_texture
 from shared.tracking.texture_tracks import Windows
 from shared.tracking.tracked_clip import TrackedClip
 
@@ -41,6 +41,9 @@ LANDMARK_FRAMES = 15
 
 FOLLOW_TEXELS = 3.0
 """Half of what the coarse pass searches; landmarks jitter by less."""
+
+SAME_PLACE_TEXELS = 1.0
+"""Of the coarse pass: places of a frame that are nearer to each other are one."""
 
 CLEARLY_MORE = 1.1
 """So many times the tracks must agree with the other place of a frame before its landmarks are not believed: between
@@ -223,20 +226,33 @@ def carried_poses(poses: np.ndarray, source: np.ndarray, target: np.ndarray) -> 
 
 def _coarse_pass(clip, model, fit, poses, between, known, progress) -> Adjusted:
     """All frames, wherever they were believed to be. A frame whose landmarks say that the head was elsewhere than
-    between [F, 4, 4] is looked for at both places: a sudden start leads the one astray, half a face in the dark the
-    other."""
-    settings = coarse_pass(clip.face_width_px)
+    between [F, 4, 4] is looked for from both places, from afar: a sudden start leads the one astray, half a face in the
+    dark the other. Where both lead to the same place, that is it; else it is the one, or what lies near a start, with
+    which most tracks agree."""
+    settings, vertices = coarse_pass(clip.face_width_px), fit.vertices
     doubtful = (poses != between).any((1, 2))
-    tracked = np.ones(clip.count, bool)
-    tracks, points, found = track_texture(clip, model, fit.vertices, poses, known, tracked, settings, progress)
+    own, others = poses, []
     if doubtful.any():
-        others, _, elsewhere = track_texture(clip, model, fit.vertices, between, known, doubtful, settings, progress)
-        agree = agreement(tracks, points, found, clip.intrinsics, settings.texel_px)
-        others_agree = agreement(others, points, elsewhere, clip.intrinsics, settings.texel_px)
-        better = doubtful & clearly_more(own=agree, other=others_agree)
-        tracks.pixels[better], tracks.whitening[better] = others.pixels[better], others.whitening[better]
-        found[better] = elsewhere[better]
+        starts, width = (poses, between), clip.face_width_px
+        own, other = look_from_afar(clip, model, vertices, starts, known, doubtful, settings, width, progress)
+        doubtful &= apart_px(vertices, own, other, clip.intrinsics) > SAME_PLACE_TEXELS * settings.texel_px
+        others = [other, poses, between] if doubtful.any() else []
+    tracks, points, found = track_texture(clip, model, vertices, own, known, np.ones(clip.count, bool), settings,
+                                          progress)
+    agree = agreement(tracks, points, found, clip.intrinsics, settings.texel_px)
+    for other in others:
+        there, _, elsewhere = track_texture(clip, model, vertices, other, known, doubtful, settings, progress)
+        there_agree = agreement(there, points, elsewhere, clip.intrinsics, settings.texel_px)
+        better = doubtful & clearly_more(own=agree, other=there_agree)
+        tracks.pixels[better], tracks.whitening[better] = there.pixels[better], there.whitening[better]
+        found[better], agree[better] = elsewhere[better], there_agree[better]
     return solve_texture(clip, tracks, points, found, settings.prior_mm)
+
+
+def apart_px(vertices: np.ndarray, poses: np.ndarray, others: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """[F] px: by how much two poses [F, 4, 4] move the middle one of the vertices [V, 3] mm."""
+    pixels = [project(vertices, some, intrinsics)[0] for some in (poses, others)]
+    return np.median(np.linalg.norm(pixels[0] - pixels[1], axis=2), axis=1)
 
 
 def agreement(
