@@ -42,6 +42,10 @@ HIGHLIGHT_ERROR = 0.1
 LEAST_MATTE_SHARE = 0.05
 """Of what a texel sends out, where its modelled highlights leave less or nothing."""
 
+DEVIATIONS_ABOVE, LEAST_UNCLIPPED = 2.0, 0.5
+"""So many deviations of the modelled light may an albedo lie above what its samples would have without any highlight,
+of a texel of whose samples that share is not clipped."""
+
 LEAST_BORDER_MM = 0.5
 """Error of where the head's outline lies, however well its surface is known."""
 
@@ -49,6 +53,12 @@ ERROR_OVER_SCATTER = 5.0
 """Variance of a texel's log albedo over the relative variance of what single frames say of it: what is wrong in some
 frames (a normal, the place of a shadow) mostly is wrong the same way in the others. Measured under hard lamps: 9 where
 frames contradict each other by 7 %, 6 by 15 %, 4 by 40 %."""
+PULL_OVER_SCATTER = 1.0
+"""The same by which bare skin follows its surroundings. Less: of real skin that moves, frames contradict each other
+about what is there, a fold or a mole, and their mean is a better guess of it than the skin around (0.6 dB of real
+held-out frames, for 0.15 dB of albedo under a hard lamp)."""
+
+LEAST_ALBEDO = 0.002
 
 PRODUCTS = 7
 """That the normal equations sum up per channel."""
@@ -127,7 +137,16 @@ class NormalEquations:
     def solve_albedo(self, specular: np.ndarray, fallback: np.ndarray, pull: float | np.ndarray) -> np.ndarray:
         """Albedo [T, 3] for given specular [T]; fallback [T, 3] acts with precision pull, a number or [T, 3]."""
         moment = self.ei - specular[:, None] * self.es
-        return np.clip((moment + pull * fallback) / (self.ee + pull), 0.002, 1.0).astype(np.float32)
+        return np.clip((moment + pull * fallback) / (self.ee + pull), LEAST_ALBEDO, 1.0).astype(np.float32)
+
+    def brightest_albedo(self, variance: np.ndarray) -> np.ndarray:
+        """[T, 3]: an albedo may not send out more than its samples show, highlights or not; variance [T, 3]: of the
+        logarithm of the modelled irradiance; infinite where the samples are mostly clipped or none. A black beard under
+        the highlights of skin has an albedo that they leave open, but not that of the skin around it."""
+        spared = self.measured_ee / np.maximum(self.measured_ee + self.clipped_ee, 1e-9)
+        told = (self.ee > 1e-6) & (spared > LEAST_UNCLIPPED)
+        matt = self.ei / np.maximum(self.ee, 1e-6)
+        return np.where(told, matt * np.exp(DEVIATIONS_ABOVE * np.sqrt(variance)), np.inf)
 
     def specular_equations(self) -> tuple[np.ndarray, np.ndarray]:
         """Curvature and moment [T] of each texel's intensity with its albedo projected out, summed over channels."""
@@ -177,7 +196,7 @@ class NormalEquations:
 @dataclass(frozen=True)
 class Evidence:
     """What the frames of all lights say: equations, information [T, 3] on the log albedo, and systematic [T, 3]: the
-    variance that is left however many frames there are."""
+    variance that is left however many frames there are, as far as it draws texels to their surroundings."""
 
     equations: NormalEquations
     information: np.ndarray
@@ -185,22 +204,27 @@ class Evidence:
 
 
 def weigh_lights(
-    parts: Sequence[NormalEquations], systematic: Sequence[np.ndarray], typical_albedo: np.ndarray
+    parts: Sequence[NormalEquations],
+    systematic: Sequence[np.ndarray],
+    typical_albedo: np.ndarray,
+    drawing: Sequence[np.ndarray] | None = None,
 ) -> Evidence:
-    """The equations of each light with the variance [T, 3] that its frames share -> of all lights together.
+    """The equations of each light with the variance [T, 3] that its frames share -> of all lights together. drawing:
+    of that variance [T, 3], what draws texels to their surroundings; None: all of it.
 
     Where one light grazes or hardly reaches a texel another one decides: two lights' errors have nothing in common.
     """
+    drawing = systematic if drawing is None else drawing
     information = sum(own.information(typical_albedo, error) for own, error in zip(parts, systematic, strict=True))
     if len(parts) == 1:
-        return Evidence(parts[0], information, systematic[0])
+        return Evidence(parts[0], information, drawing[0])
     whole = NormalEquations(len(information), parts[0].noise)
     left = np.zeros_like(information)
-    for own, error in zip(parts, systematic, strict=True):
+    for own, error, draws in zip(parts, systematic, drawing, strict=True):
         share = own.independent_share(typical_albedo, error)
         whole.sums += own.sums * np.tile(share, PRODUCTS)
         whole.clipped_ee += own.clipped_ee * share
-        left += np.square(own.ee * share) * error
+        left += np.square(own.ee * share) * draws
     return Evidence(whole, information, left / np.maximum(np.square(whole.ee), 1e-12))
 
 
@@ -239,11 +263,11 @@ class ScatterSums:
                     self.sums)
 
     def variance(self) -> np.ndarray:
-        """[T, 3] of the log albedo: ERROR_OVER_SCATTER times the relative variance of errors, beyond a common factor,
-        which is the albedo's, and beyond the samples' noise."""
+        """[T, 3]: relative variance of what single frames say of the albedo: of errors beyond a common factor, which is
+        the albedo's, and beyond the samples' noise."""
         squared, along, power, weight = (self.sums[:, 3 * k : 3 * k + 3] for k in range(4))
         power = np.maximum(power, 1e-6)
-        return ERROR_OVER_SCATTER * np.maximum(squared - along**2 / power - weight, 0.0) / power
+        return np.maximum(squared - along**2 / power - weight, 0.0) / power
 
 
 @compiled

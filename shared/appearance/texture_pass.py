@@ -10,9 +10,12 @@ from typing import TypeVar
 import numpy as np
 
 from shared.appearance.texture import (
+    ERROR_OVER_SCATTER,
     IRRADIANCE_ERROR,
+    LEAST_ALBEDO,
     NORMAL_ERROR,
     PRIOR_SPREAD,
+    PULL_OVER_SCATTER,
     BorderSums,
     Evidence,
     Noise,
@@ -62,7 +65,9 @@ class TexturePass:
     specular: the clip's one intensity or each texel's [T], the prior's mean; typical_albedo [3]; sigma: how far a texel
     may leave it;
     light_weights: how much samples of each light count, by how well the model follows it; empty: all alike;
-    region [V]: parts of the head, skin and hair, of which one says nothing of the other.
+    region [V]: parts of the head, skin and hair, of which one says nothing of the other;
+    bare [V] bool: bare skin, None: all; of brows, lips or clothes the skin around says nothing, however much frames
+    contradict each other there.
     """
 
     def __init__(
@@ -77,6 +82,7 @@ class TexturePass:
         noise: Noise | None = None,
         light_weights: Sequence[float] = (),
         region: np.ndarray | None = None,
+        bare: np.ndarray | None = None,
         context: RunContext = SILENT,
     ):
         self.surface, self.viewer, self.shading, self.views = surface, viewer, shading, views
@@ -88,6 +94,7 @@ class TexturePass:
         ]
         self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), context.progress
         self.region = region
+        self.bare = 1.0 if bare is None else surface.interpolate(bare[:, None].astype(np.float32))
 
     def _systematic(self, frames: np.ndarray) -> np.ndarray:
         """[T, 3]: variance of the log albedo that all frames of one light share."""
@@ -127,10 +134,14 @@ class TexturePass:
             self._share_out(view, partial(self._add, material, part, border, scatter))
         for part, weight in zip(parts, self.light_weights, strict=True):
             part.scale(weight)
-        systematic = [error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
-                      + part.highlight_variance(self.specular) + scatter.variance()
-                      for error, border, part, scatter in zip(self.systematic, borders, parts, scatters, strict=True)]
-        return weigh_lights(parts, systematic, self.typical_albedo)
+        steady = [error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
+                  + part.highlight_variance(self.specular)
+                  for error, border, part in zip(self.systematic, borders, parts, strict=True)]
+        scattered = [scatter.variance() for scatter in scatters]
+        systematic = [error + ERROR_OVER_SCATTER * scatter for error, scatter in zip(steady, scattered, strict=True)]
+        drawing = [error + PULL_OVER_SCATTER * self.bare * scatter
+                   for error, scatter in zip(steady, scattered, strict=True)]
+        return weigh_lights(parts, systematic, self.typical_albedo, drawing)
 
     def view(self, f: int) -> FrameView:
         """One frame with the values that LitSamples takes."""
@@ -186,12 +197,13 @@ class TexturePass:
         total = np.maximum(certain.sum(1, keepdims=True), 1e-9)
         believed = (certain * own).sum(1, keepdims=True) / total
         left = np.clip(believed - own, 0.0, 1.0) / np.maximum(1.0 - own, 1e-3)
-        found = []
+        dim = np.maximum(systematic - equations.highlight_variance(self.specular), 0.0)
+        brightest, found = np.maximum(equations.brightest_albedo(dim), LEAST_ALBEDO), []
         for k, specular in enumerate(intensities):
             smooth = np.exp(self.surface.interpolate(around[..., k]))
             brighter = (certain * np.log(np.maximum(rough[k], 1e-3) / smooth)).sum(1, keepdims=True) / total
             albedo = equations.solve_albedo(specular, smooth * np.exp(brighter * left), pull)
-            found.append(TexelMaterial(albedo, specular, information.min(1)))
+            found.append(TexelMaterial(np.minimum(albedo, brightest).astype(np.float32), specular, information.min(1)))
         return found
 
     def _surroundings(self, rough: list[np.ndarray], information: np.ndarray, fields: SmoothFields) -> np.ndarray:

@@ -29,6 +29,7 @@ from shared.inverse.lamp_distance import describe_lamp, find_lamp
 from shared.inverse.lit_surface import LitSurface, report_to
 from shared.inverse.model_selection import SelectedModel, select
 from shared.inverse.problem import (
+    FACE_SKIN,
     InverseResult,
     InverseSettings,
     frames_to_fit,
@@ -109,7 +110,8 @@ def solve_clip(
     typical = np.median(solution.state.albedo, axis=0)
     texture = TexturePass(
         texels, viewer, shading, views, specular=specular_at(texels, solution), typical_albedo=typical,
-        light_weights=solution.light_weights, region=scalp_of(surface), context=context,
+        light_weights=solution.light_weights, region=scalp_of(surface), bare=surface.vertices_of(FACE_SKIN),
+        context=context,
     )
     widths = settings.map_size * np.array(settings.specular_widths if settings.appearance.specular else (np.inf,))
     material, texture_record = texture.run(widths)

@@ -5,7 +5,6 @@ import pytest
 from shapes import grid_plane
 
 from shared.appearance.texture import (
-    ERROR_OVER_SCATTER,
     LEAST_BORDER_MM,
     PRIOR_SPREAD,
     BorderSums,
@@ -141,6 +140,20 @@ def test_errors_of_highlights_count_by_their_share():
     assert np.allclose(by_texel[[0, 2, 3]], variance[[0, 2, 3]]) and (by_texel[1] < 0.5 * variance[1]).all()
 
 
+def test_no_albedo_sends_out_more_than_its_samples_show():
+    """Highlights may be any share of what a black beard sends out; what it shows without any bounds its albedo, looser
+    where the light is in doubt and not at all where most samples are clipped."""
+    radiance, saturation = np.full((6, 3, 3), 0.02), np.zeros((6, 3, 3), np.int8)
+    saturation[:4, 1] = 1
+    irradiance, reflection = np.full((6, 3, 3), 0.8), np.full((6, 3, 3), 0.1)
+    irradiance[:, 2] = 0.0
+    equations = accumulated(irradiance, reflection, radiance, np.ones((6, 3)), saturation)
+    sure = equations.brightest_albedo(np.zeros((3, 3)))
+    assert np.allclose(sure[0], 0.02 / 0.8) and np.isinf(sure[1:]).all()
+    assert np.allclose(equations.brightest_albedo(np.full((3, 3), 0.04))[0], np.exp(0.4) * 0.02 / 0.8)
+    assert equations.solve_albedo(np.full(3, 0.5), 0.3, 1e6)[0, 0] > 0.25, "what the skin around would make of it"
+
+
 def test_scatter_is_what_frames_contradict_each_other_by():
     """Relative errors of +-0.4 in frames of one brightness have the variance 0.16; an error that all frames share is
     the albedo's; clipped samples contradict nothing, and noise is no scatter."""
@@ -159,7 +172,7 @@ def test_scatter_is_what_frames_contradict_each_other_by():
     for f in range(frames):
         samples = TexelSamples(rows, colours[f], np.full(texels, 0.5), saturation[f])
         sums.add(samples, model[f], model[f], np.zeros((texels, 3)))
-    variance = sums.variance() / ERROR_OVER_SCATTER
+    variance = sums.variance()
     # About the best common factor, which is 1 / 1.16: sum (1.4 x - 1)^2 + (0.6 x - 1)^2 over sum of their squares.
     best = 1.0 / 1.16
     expected = ((1.4 * best - 1) ** 2 + (0.6 * best - 1) ** 2) / (1.4**2 + 0.6**2)
