@@ -126,8 +126,8 @@ def common_expression(
     landmarks_px: np.ndarray,
     counts: np.ndarray,
 ) -> CommonExpression:
-    """Of the frames that count [F] bool; the others are out for another reason and are not compared. vertices [V, 3] mm
-    of the fitted head, camera_from_head [F, 4, 4], intrinsics [3, 3], landmarks_px [F, 468, 2]."""
+    """Of the frames that count; the others are out for another reason and are not compared. vertices [V, 3] mm of the
+    fitted head, camera_from_head [F, 4, 4], intrinsics [3, 3], landmarks_px [F, 468, 2], counts [F] bool."""
     frames = np.nonzero(counts)[0]
     shown, away_mm = np.ones(len(counts), bool), np.zeros((len(counts), len(FEATURES)))
     if len(frames) < LEAST_FRAMES:

@@ -250,7 +250,7 @@ def _coarse_pass(clip, model, fit, poses, between, known, progress) -> Adjusted:
 
 
 def apart_px(vertices: np.ndarray, poses: np.ndarray, others: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """[F] px: by how much two poses [F, 4, 4] move the middle one of the vertices [V, 3] mm."""
+    """[F] px: by how much poses [F, 4, 4] and others [F, 4, 4] show the vertices [V, 3] mm apart, in the median."""
     pixels = [project(vertices, some, intrinsics)[0] for some in (poses, others)]
     return np.median(np.linalg.norm(pixels[0] - pixels[1], axis=2), axis=1)
 
