@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from shared.compute.robust import ROBUST_SCALE
-from shared.geometry.transforms import nearest_rotation, rotation_range_deg, vector_from_rotation
+from shared.geometry.transforms import rotation_range_deg
 from shared.tracking.head_model import HeadModel
+from shared.tracking.pose_uncertainty import turns_from_mean
 
 LIMIT_MM, JITTERS = 3.0, 7.0
 """Another expression: so far from the common one, and by so many times what the nose's landmarks jitter by from frame
@@ -170,8 +171,7 @@ def feature_values(model: HeadModel, offsets: np.ndarray) -> np.ndarray:
 def turn_basis(poses: np.ndarray) -> np.ndarray:
     """[F, 7]: what a landmark's bias may follow: one, then the turn [F, 3] from the mean pose and its squares, each of
     mean 0 and deviation 1."""
-    rotations = poses[:, :3, :3]
-    turn = vector_from_rotation(rotations @ nearest_rotation(rotations.sum(0)).T)
+    turn = turns_from_mean(poses[:, :3, :3])
     varying = np.concatenate([turn, turn**2], axis=1)
     varying = (varying - varying.mean(0)) / np.maximum(varying.std(0), 1e-9)
     return np.concatenate([np.ones((len(turn), 1)), varying], axis=1)

@@ -95,7 +95,7 @@ def rotations_apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return vector_from_rotation(first @ np.swapaxes(second @ common, 1, 2))
 
 
-def _turns(rotations: np.ndarray) -> np.ndarray:
+def turns_from_mean(rotations: np.ndarray) -> np.ndarray:
     """[F, 3] rotation vectors (camera axes) of rotations [F, 3, 3] from their mean."""
     return vector_from_rotation(rotations @ nearest_rotation(rotations.sum(0)).T)
 
@@ -158,7 +158,7 @@ def estimate_uncertainty(
     known = uncertain if solve_focal else pose_covariance(solved, tracks, lens, loss_scale=loss, motion=motion)
     covariance = np.full((len(shown), 6, 6), np.nan)
     covariance[shown] = known.poses
-    turn = _turns(solved.camera_from_points[:, :3, :3])
+    turn = turns_from_mean(solved.camera_from_points[:, :3, :3])
     covariance[shown, :3, :3] += SHADING_SLIP**2 * turn[:, :, None] * turn[:, None, :]
     apart = rotations_apart(solved.camera_from_points[:, :3, :3], free.camera_from_points[:, :3, :3])
     held_off = None

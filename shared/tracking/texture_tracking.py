@@ -163,7 +163,6 @@ def look_from_afar(
     known: np.ndarray,
     guessed: np.ndarray,
     settings: TrackingPass,
-    face_width_px: float,
     progress: Callable,
 ) -> list[np.ndarray]:
     """Poses [F, 4, 4] like each of the starts, in which the guessed frames [F] bool lie where the mean of the known
@@ -174,7 +173,7 @@ def look_from_afar(
     """
     starts, wanted = list(starts), np.nonzero(guessed)[0]
     for larger, rounds in COARSER:
-        if face_width_px < LEAST_FACE_TEXELS * larger * settings.texel_px:
+        if clip.face_width_px < LEAST_FACE_TEXELS * larger * settings.texel_px:
             continue
         windows = replace(settings.windows, least_spread=AFAR_SPREAD)
         coarser = replace(settings, texel_px=larger * settings.texel_px, windows=windows)

@@ -233,8 +233,8 @@ def _coarse_pass(clip, model, fit, poses, between, known, progress) -> Adjusted:
     doubtful = (poses != between).any((1, 2))
     own, others = poses, []
     if doubtful.any():
-        starts, width = (poses, between), clip.face_width_px
-        own, other = look_from_afar(clip, model, vertices, starts, known, doubtful, settings, width, progress)
+        starts = poses, between
+        own, other = look_from_afar(clip, model, vertices, starts, known, doubtful, settings, progress)
         doubtful &= apart_px(vertices, own, other, clip.intrinsics) > SAME_PLACE_TEXELS * settings.texel_px
         others = [other, poses, between] if doubtful.any() else []
     tracks, points, found = track_texture(clip, model, vertices, own, known, np.ones(clip.count, bool), settings,

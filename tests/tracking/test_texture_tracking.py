@@ -22,6 +22,11 @@ LENS = np.array([[1800.0, 0, SIZE / 2], [0, 1800.0, SIZE / 2], [0, 0, 1]])
 LOST = np.array([3, 7])
 
 
+def across(width_px, frames):
+    """Landmarks [F, 2, 2] px of a face of that width."""
+    return np.tile([[0.0, 0.0], [width_px, 0.0]], (frames, 1, 1))
+
+
 def whole(items, label=""):
     return items
 
@@ -43,8 +48,8 @@ def egg_clip():
         noise = np.random.default_rng(seed).normal(0, 3.0, picture.shape)
         pictures.append((picture + noise).round().clip(0, 255).astype(np.uint8))
     clean = [np.zeros((SIZE, SIZE), np.uint8)] * len(poses)
-    clip = TrackedClip(pictures, pictures, clean, np.empty((len(poses), 0, 2)), np.arange(len(poses)) / 25.0, LENS,
-                       (SIZE, SIZE))  # fmt: skip
+    landmarks = across(WIDTH_PX, len(poses))
+    clip = TrackedClip(pictures, pictures, clean, landmarks, np.arange(len(poses)) / 25.0, LENS, (SIZE, SIZE))
     return model, clip, poses
 
 
@@ -61,7 +66,7 @@ def test_a_frame_is_found_from_where_a_single_pass_stays(egg_clip):
         _, _, found = track_texture(*arguments, start, ~lost, lost, settings, whole)
         return np.degrees(np.linalg.norm(rotations_apart(found[:, :3, :3], poses[:, :3, :3]), axis=1))[lost]
 
-    near, = look_from_afar(*arguments, [begun], ~lost, lost, settings, WIDTH_PX, whole)
+    near, = look_from_afar(*arguments, [begun], ~lost, lost, settings, whole)
     assert np.array_equal(near[~lost], poses[~lost])
     assert off_deg(begun).min() > 3.0
     assert off_deg(near).max() < 0.3
@@ -70,6 +75,6 @@ def test_a_frame_is_found_from_where_a_single_pass_stays(egg_clip):
 def test_a_small_face_is_not_looked_for_in_texels_that_show_nothing_of_it(egg_clip):
     """Of a face 55 px wide a window of texels twice as large would see nearly all."""
     model, clip, poses = egg_clip
-    lost = np.isin(np.arange(clip.count), LOST)
-    far, = look_from_afar(clip, model, model.template, [poses + 0.0], ~lost, lost, coarse_pass(55.0), 55.0, whole)
+    lost, small = np.isin(np.arange(clip.count), LOST), replace(clip, landmarks_px=across(55.0, clip.count))
+    far, = look_from_afar(small, model, model.template, [poses + 0.0], ~lost, lost, coarse_pass(55.0), whole)
     assert np.array_equal(far, poses)
