@@ -66,7 +66,7 @@ PUBLISHED = ParameterGroup(
 
 STAGE = Stage(
     name="inverse_render",
-    version=25,
+    version=26,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -303,7 +303,7 @@ def run(job: Job) -> None:
 def check(job: Job) -> None:
     """Maps in range, light positive, part of the map determined, re-renders that are not black."""
     from shared.appearance.projection import SPECULAR_RANGE
-    from shared.inverse.solve import LEAST_SHARE
+    from shared.inverse.solve import LEAST_SEEN_SHARE
     from shared.io.arrays import read_json
     from shared.io.images import read_exr
 
@@ -313,7 +313,7 @@ def check(job: Job) -> None:
         if not (image.min() >= 0.0 and image.max() <= highest):
             raise LimnError(f"{name} leaves [0, {highest:g}]: {image.min():.3f} .. {image.max():.3f}")
     record = read_json(job.out / "solve.json")
-    if not record["seen_share_of_texels"] > LEAST_SHARE:
+    if not record["seen_share_of_texels"] > LEAST_SEEN_SHARE:
         raise InputError("the clip shows less than a hundredth of the map", where=str(job.subject.folder),
                          hint="film with more light, sharper, with a wider turn, or with exposure and lamps that stay: "
                               "frames that contradict each other show little")

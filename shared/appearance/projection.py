@@ -24,6 +24,8 @@ SPECULAR_RANGE = (0.0, 2.0)
 """Of the specular intensity: at the upper end the reflectance at normal incidence is 0.08, twice skin's."""
 ROUGHNESS_RANGE, ROUGHNESS_SPREAD = (0.1, 0.7), 0.35
 """Of skin; the spread is the standard deviation of the prior on its logarithm, about where the fit starts."""
+NEAR_END = 0.01
+"""Share of its range within which a parameter counts as at the end of it."""
 LARGEST_ROUGHNESS_STEP = 0.08
 """Of a step, in the logarithm: lobes are linearised, and their peak goes with the inverse fourth power."""
 
@@ -128,3 +130,11 @@ def _prior(settings: AppearanceSettings, state: AppearanceState) -> tuple[np.nda
     mean, sigma = settings.specular_prior
     back = np.log(settings.roughness / state.roughness)
     return np.array([mean, back]), np.array([(mean * sigma) ** -2, ROUGHNESS_SPREAD**-2])
+
+
+def reached_end(value: float, allowed: tuple[float, float]) -> str:
+    """"lower" or "upper" where a value lies within NEAR_END of that end of its allowed range, else ""."""
+    share = (value - allowed[0]) / (allowed[1] - allowed[0])
+    if share < NEAR_END:
+        return "lower"
+    return "upper" if share > 1.0 - NEAR_END else ""

@@ -195,37 +195,38 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the frames of all lights say: equations, information [T, 3] on the log albedo, and systematic [T, 3]: the
-    variance that is left however many frames there are, as far as it draws texels to their surroundings."""
+    """What the frames of all lights say: equations, information [T, 3] on the log albedo, and, for each way to draw
+    texels to their surroundings, the variance [T, 3] by which it does, however many frames there are."""
 
     equations: NormalEquations
     information: np.ndarray
-    systematic: np.ndarray
+    drawing: tuple[np.ndarray, ...]
 
 
 def weigh_lights(
     parts: Sequence[NormalEquations],
     systematic: Sequence[np.ndarray],
     typical_albedo: np.ndarray,
-    drawing: Sequence[np.ndarray] | None = None,
+    drawing: Sequence[Sequence[np.ndarray]] | None = None,
 ) -> Evidence:
     """The equations of each light with the variance [T, 3] that its frames share -> of all lights together. drawing:
-    of that variance [T, 3], what draws texels to their surroundings; None: all of it.
+    for each light and each way, the variance [T, 3] that draws texels to their surroundings; None: one way, all of it.
 
     Where one light grazes or hardly reaches a texel another one decides: two lights' errors have nothing in common.
     """
-    drawing = systematic if drawing is None else drawing
+    drawing = [(error,) for error in systematic] if drawing is None else drawing
     information = sum(own.information(typical_albedo, error) for own, error in zip(parts, systematic, strict=True))
     if len(parts) == 1:
-        return Evidence(parts[0], information, drawing[0])
+        return Evidence(parts[0], information, tuple(drawing[0]))
     whole = NormalEquations(len(information), parts[0].noise)
-    left = np.zeros_like(information)
-    for own, error, draws in zip(parts, systematic, drawing, strict=True):
+    left = [np.zeros_like(information) for _ in drawing[0]]
+    for own, error, ways in zip(parts, systematic, drawing, strict=True):
         share = own.independent_share(typical_albedo, error)
         whole.sums += own.sums * np.tile(share, PRODUCTS)
         whole.clipped_ee += own.clipped_ee * share
-        left += np.square(own.ee * share) * draws
-    return Evidence(whole, information, left / np.maximum(np.square(whole.ee), 1e-12))
+        for sums, draws in zip(left, ways, strict=True):
+            sums += np.square(own.ee * share) * draws
+    return Evidence(whole, information, tuple(sums / np.maximum(np.square(whole.ee), 1e-12) for sums in left))
 
 
 class BorderSums:

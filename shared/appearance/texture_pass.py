@@ -40,6 +40,10 @@ Result = TypeVar("Result")
 _ALBEDO_PULL = 10.0
 NEIGHBOUR_STEP, SURROUNDINGS_SPREAD = 0.05, 3.0
 """Standard deviations of the log albedo: from one vertex to the next, and from the person's typical skin."""
+CONTRADICTED, LEAST_GAIN = ("as the skin around", "as their mean"), 0.99
+"""What bare texels that frames contradict each other about look like. Under a hard lamp the model is wrong there in all
+frames alike, and the skin around is the better guess; where poses are off, or skin moves, their mean is. Held-out
+frames, in which the mean always fits a little better, have to say so by a hundredth."""
 FIRST_PASS_FRAMES = 32
 """Enough to tell what a texel looks like, so that every frame's samples can be weighed by it."""
 
@@ -110,7 +114,7 @@ class TexturePass:
         fitted = np.nonzero(self.views.fitted)[0]
         some = fitted[spread_frames(len(fitted), FIRST_PASS_FRAMES, self.views.light_index[fitted])]
         fields = SmoothFields(self.surface.mesh, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD, self.region)
-        (first,) = self._close(self._accumulate(None, some, "texture, first pass"), [mean], fields)
+        first = self._close(self._accumulate(None, some, "texture, first pass"), [mean], fields)[0]
         evidence = self._accumulate(first, fitted, "texture, second pass")
         pooled = [
             pooled_specular(self.surface, evidence.equations, width, mean=self.specular, sigma=self.sigma)
@@ -118,11 +122,17 @@ class TexturePass:
         ]
         candidates = self._close(evidence, pooled, fields)
         del evidence, fields  # a hundred bytes per texel that the frames to come need
-        errors = self.held_out_errors(candidates)
-        best = int(np.argmin(errors))
+        errors = np.reshape(self.held_out_errors(candidates), (len(CONTRADICTED), len(widths)))
+        way = int(errors[1].min() < LEAST_GAIN * errors[0].min())
+        best = int(np.argmin(errors[way]))
         names = ["one value" if not np.isfinite(width) else f"{width:g} texels" for width in widths]
-        record = {"held_out": dict(zip(names, errors, strict=True)), "chosen": names[best]}
-        return candidates[best], record
+        record = {
+            "held_out": dict(zip(names, errors[way].tolist(), strict=True)),
+            "chosen": names[best],
+            "contradicted": {"held_out": dict(zip(CONTRADICTED, errors.min(1).tolist(), strict=True)),
+                             "chosen": CONTRADICTED[way]},
+        }
+        return candidates[way * len(widths) + best], record
 
     def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> Evidence:
         parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]
@@ -139,7 +149,7 @@ class TexturePass:
                   for error, border, part in zip(self.systematic, borders, parts, strict=True)]
         scattered = [scatter.variance() for scatter in scatters]
         systematic = [error + ERROR_OVER_SCATTER * scatter for error, scatter in zip(steady, scattered, strict=True)]
-        drawing = [error + PULL_OVER_SCATTER * self.bare * scatter
+        drawing = [(error + PULL_OVER_SCATTER * self.bare * scatter, error)
                    for error, scatter in zip(steady, scattered, strict=True)]
         return weigh_lights(parts, systematic, self.typical_albedo, drawing)
 
@@ -181,29 +191,31 @@ class TexturePass:
     def _close(
         self, evidence: Evidence, intensities: list[np.ndarray], fields: SmoothFields
     ) -> list[TexelMaterial]:
-        """Albedo for each of some given intensities [T]; channels left open by the samples follow the others and the
-        neighbourhood.
+        """Albedo for each way to draw texels and, inside it, each of some given intensities [T]; channels left open by
+        the samples follow the others and the neighbourhood.
 
         A channel whose samples have the share q of its albedo leaves 1 - q to a fallback. The texel's brightness b
         beside its neighbourhood, by all channels, is believed by their share q': the fallback has b (q' - q) / (1 - q)
         of it, so that channels that know alike get what their own samples say once, and one that is clipped gets q' b.
         """
-        equations, information, systematic = evidence.equations, evidence.information, evidence.systematic
+        equations, information = evidence.equations, evidence.information
         rough = [equations.solve_albedo(specular, 0.0, 1e-6) for specular in intensities]
         around = self._surroundings(rough, information, fields).astype(np.float32)
-        pull = _ALBEDO_PULL + equations.ee * (systematic / PRIOR_SPREAD**2)
-        own = equations.ee / (equations.ee + pull)
-        certain = own * information / (1.0 + information)
-        total = np.maximum(certain.sum(1, keepdims=True), 1e-9)
-        believed = (certain * own).sum(1, keepdims=True) / total
-        left = np.clip(believed - own, 0.0, 1.0) / np.maximum(1.0 - own, 1e-3)
-        dim = np.maximum(systematic - equations.highlight_variance(self.specular), 0.0)
-        brightest, found = np.maximum(equations.brightest_albedo(dim), LEAST_ALBEDO), []
-        for k, specular in enumerate(intensities):
-            smooth = np.exp(self.surface.interpolate(around[..., k]))
-            brighter = (certain * np.log(np.maximum(rough[k], 1e-3) / smooth)).sum(1, keepdims=True) / total
-            albedo = equations.solve_albedo(specular, smooth * np.exp(brighter * left), pull)
-            found.append(TexelMaterial(np.minimum(albedo, brightest).astype(np.float32), specular, information.min(1)))
+        highlights, found = equations.highlight_variance(self.specular), []
+        for drawing in evidence.drawing:
+            pull = _ALBEDO_PULL + equations.ee * (drawing / PRIOR_SPREAD**2)
+            own = equations.ee / (equations.ee + pull)
+            certain = own * information / (1.0 + information)
+            total = np.maximum(certain.sum(1, keepdims=True), 1e-9)
+            believed = (certain * own).sum(1, keepdims=True) / total
+            left = np.clip(believed - own, 0.0, 1.0) / np.maximum(1.0 - own, 1e-3)
+            brightest = equations.brightest_albedo(np.maximum(drawing - highlights, 0.0))
+            for k, specular in enumerate(intensities):
+                smooth = np.exp(self.surface.interpolate(around[..., k]))
+                brighter = (certain * np.log(np.maximum(rough[k], 1e-3) / smooth)).sum(1, keepdims=True) / total
+                albedo = equations.solve_albedo(specular, smooth * np.exp(brighter * left), pull)
+                albedo = np.minimum(albedo, np.maximum(brightest, LEAST_ALBEDO)).astype(np.float32)
+                found.append(TexelMaterial(albedo, specular, information.min(1)))
         return found
 
     def _surroundings(self, rough: list[np.ndarray], information: np.ndarray, fields: SmoothFields) -> np.ndarray:

@@ -41,7 +41,7 @@ POINTS, FIRST_STEPS, STEPS = 400, 8, 3
 """Surface points that distances are judged on, and steps of the light at the first and at each other distance."""
 LAMP_REACH, LAMP_SHARE = np.radians(30.0), 0.1
 """Texels so near to the brightest, and so bright beside it, belong to its lamp."""
-LEAST_SHARE = 0.25
+LEAST_LAMP_SHARE = 0.25
 """Of the light, along directions that a lamp shines from: of one that gives less, the distance hardly shows."""
 PASSING_POINTS = 64
 ACROSS = 3.0
@@ -151,11 +151,11 @@ def main_lamp(light: np.ndarray, capture: Capture, views: Views, moves: str, dis
 
 
 def lit_by_lamp(capture: Capture, solution: Solution) -> bool:
-    """Whether a lamp gives LEAST_SHARE of the light in some frame, seen along an even set of directions."""
+    """Whether a lamp gives LEAST_LAMP_SHARE of the light in some frame, seen along an even set of directions."""
     along = light_along(solution.state.light, capture.directions, capture.world_from_head)
     arriving = along.mean(2)
     share = arriving[concentrated(along)].sum(0) / np.maximum(arriving.sum(0), 1e-12)
-    return bool(share.max() > LEAST_SHARE)
+    return bool(share.max() > LEAST_LAMP_SHARE)
 
 
 def directions_towards(lamp: NearLamp, lit: LitSurface, views: Views, moves: str) -> np.ndarray:

@@ -181,7 +181,8 @@ def conclude(
     solution = Solution(state, tuple(_thinned(records)), fit, held)
     shading = shade_vertices(views, viewer, precomputed, appearance, solution, context)
     record = {
-        "texture": {"held_out": {"per texel": held}, "chosen": "per texel"},
+        "texture": {"held_out": {"per texel": held}, "chosen": "per texel",
+                    "contradicted": {"held_out": {}, "chosen": ""}},
         "albedo_scale": describe_scale(None, np.median(state.albedo, axis=0)) | {"method": SCALE},
         "warnings": [],
     }

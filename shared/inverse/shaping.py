@@ -123,5 +123,8 @@ def refine_and_light(
     )
     light_views = some_views(views, settings, settings.light_frames)
     lit = LitSurface.of(refined.surface, light_views, settings, chart, context, surface.mesh, directions, solution.lamp)
-    then = fit_appearance(lit.coarse, settings.appearance, report_to(context), start=solution)
+    # Highlights that led astray on a mesh that was wrong are tried again on a better one.
+    again = settings.appearance.specular and not solution.highlights_count
+    start = replace(solution, highlights_count=True) if again else solution
+    then = fit_appearance(lit.coarse, settings.appearance, report_to(context), start=start, shapes=again)
     return RefinedMesh(lit, then, refined.stopped)

@@ -15,7 +15,7 @@ from shared.appearance.light_models import SeveralLights
 from shared.appearance.local_roughness import local_roughness
 from shared.appearance.maps import make_maps
 from shared.appearance.problem import AppearanceProblem, AppearanceSettings
-from shared.appearance.projection import SPECULAR_RANGE
+from shared.appearance.projection import ROUGHNESS_RANGE, SPECULAR_RANGE, reached_end
 from shared.appearance.texture_pass import TexturePass
 from shared.capture.chart import ChartObservation
 from shared.compute.run_context import SILENT, RunContext
@@ -41,7 +41,7 @@ from shared.inverse.shaping import shape_and_turn
 from shared.shape.gauss_newton import typical_edge
 from shared.shape.refine import meet_outline, surface_error
 
-LEAST_SHARE = 0.01
+LEAST_SEEN_SHARE = 0.01
 """Of the map: a clip that shows less of it gives no result, and one that determines less gives a warning."""
 HAIRLINE_MM = 10.0
 """Bends of the hairline shorter than this are the mesh's, not the hair's."""
@@ -193,6 +193,7 @@ def summarise(result: InverseResult, moves: str) -> dict:
             "light": describe_light(state),
             "specular_intensity": round(state.specular, 4),
             "specular_variation": "by segment" if solution.local_specular else result.record["texture"]["chosen"],
+            "contradicted_texels": result.record["texture"]["contradicted"]["chosen"],
             "roughness": round(state.roughness, 4),
             "roughness_variation": solution.roughness_record,
             "moves": moves,
@@ -201,6 +202,7 @@ def summarise(result: InverseResult, moves: str) -> dict:
             "fitted": solution.fitted,
             "held_out": solution.held_out,
             "texture_held_out": result.record["texture"]["held_out"],
+            "contradicted_held_out": result.record["texture"]["contradicted"]["held_out"],
         },
         **{key: result.record[key] for key in ("shape", "poses", "relief", "diagnostics") if key in result.record},
         **({"lamp": lamp} if (lamp := result.record.get("lamp")) else {}),
@@ -214,15 +216,29 @@ def summarise(result: InverseResult, moves: str) -> dict:
 
 def warnings_about(result: InverseResult) -> list[str]:
     """What a person should know before using the maps."""
-    found, solution = list(result.record["warnings"]), result.solution
+    solution = result.solution
+    found = list(result.record["warnings"]) + highlight_warnings(solution)
     if solution.held_out > 1.3 * solution.fitted:
         found.append(
             f"frames held out fit worse ({solution.held_out:.4f}) than fitted ones ({solution.fitted:.4f}): "
             "poses or shape may be off, or the light changed"
         )
-    if (result.maps["confidence"] > 0.5).mean() < LEAST_SHARE:
+    if (result.maps["confidence"] > 0.5).mean() < LEAST_SEEN_SHARE:
         found.append("the clip determines hardly any of the maps (see the confidence map): its frames contradict each "
                      "other, or are too dark or blurred")
     if solution.held_out > 0.06:
         found.append(f"the model explains the clip poorly: residual {solution.held_out:.3f} of full scale")
     return found
+
+
+def highlight_warnings(solution: Solution) -> list[str]:
+    """Where roughness or specular intensity are not what this person's highlights show."""
+    state = solution.state
+    if state.specular == 0.0:
+        return []
+    if not solution.highlights_count:
+        return ["highlights led the fit astray, so roughness and specular intensity are usual values of skin: the clip "
+                "shows few, or its shape or light is off where they lie"]
+    values = (("roughness", state.roughness, ROUGHNESS_RANGE), ("specular intensity", state.specular, SPECULAR_RANGE))
+    return [f"the {name} ended at {value:.2f}, the {end} end of its range: it is not this person's, but takes up what "
+            "the light or the shape lacks" for name, value, allowed in values if (end := reached_end(value, allowed))]

@@ -192,8 +192,8 @@ def test_the_light_whose_error_is_smaller_decides():
     each = [own.information(np.full(3, 0.4), wrong) for own, wrong in zip(parts, systematic, strict=True)]
     assert np.allclose(evidence.information, each[0] + each[1])
     assert (evidence.information[0] > 1.9 * each[0][0]).all()
-    assert evidence.systematic[0, 0] == pytest.approx(5e-4, rel=0.01)
-    assert evidence.systematic[1, 0] < 1.1e-3
+    assert evidence.drawing[0][0, 0] == pytest.approx(5e-4, rel=0.01)
+    assert evidence.drawing[0][1, 0] < 1.1e-3
 
 
 def test_one_light_alone_is_weighed_as_ever():

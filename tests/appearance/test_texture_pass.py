@@ -166,27 +166,47 @@ def test_what_frames_contradict_each_other_about_is_not_trusted():
     assert np.quantile(confidence[agreed & (np.abs(uv[:, 1] - 0.5) < 0.4)], 0.05) > 0.8
 
 
-@pytest.mark.parametrize("bare", [True, False])
-def test_what_frames_contradict_each_other_about_keeps_its_mean_beside_bare_skin(bare):
-    """Under a light that the model has 60 % too bright or too dark by turns: bare skin is drawn to what is
-    around, a brow is not, and neither is trusted."""
+def contradicted_plate(bare=None, wrong=0.6):
+    """Maps of a plate, and the record, under a light that the model has too bright or too dark by turns, by a share, on
+    the half of its texels that is returned too; bare: whether they are skin."""
     mesh = grid_plane(33, 80.0)
 
     class WrongPlate(PlateShading):
         def irradiance(self, frame):
-            wrong = np.where(mesh.uvs[:, :1] < 0.4, 0.6 * (-1.0) ** frame, 0.0)
-            return super().irradiance(frame) * (1.0 + wrong)
+            share = np.where(mesh.uvs[:, :1] < 0.4, wrong * (-1.0) ** frame, 0.0)
+            return super().irradiance(frame) * (1.0 + share)
 
     surface, viewer, views = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh), plate_views(mesh, PlateShading(mesh))
-    found = []
-    for some in (None, np.full(len(mesh.vertices), bare)):
-        texture = TexturePass(surface, viewer, WrongPlate(mesh), views, SPECULAR, np.array([0.5, 0.4, 0.25]), bare=some)
-        found.append(texture.run((np.inf,))[0])
-    skin, other = found
-    inside = texel_uv(surface)[:, 0] < 0.35
-    assert np.array_equal(skin.information, other.information)
-    detail = [np.log(material.albedo)[inside].std(0).min() for material in found]
-    assert np.array_equal(skin.albedo, other.albedo) if bare else detail[1] > 1.2 * detail[0]
+    bare = None if bare is None else np.full(len(mesh.vertices), bare)
+    texture = TexturePass(surface, viewer, WrongPlate(mesh), views, SPECULAR, np.array([0.5, 0.4, 0.25]), bare=bare)
+    material, record = texture.run((np.inf,))
+    return material, record["contradicted"], texel_uv(surface)[:, 0] < 0.35
+
+
+def detail_of(material, inside):
+    return np.log(material.albedo)[inside].std(0).min()
+
+
+def test_what_frames_contradict_each_other_about_is_drawn_to_bare_skin(monkeypatch):
+    """Bare skin is drawn to what is around, a brow is not, and neither is trusted."""
+    monkeypatch.setattr("shared.appearance.texture_pass.LEAST_GAIN", 0.0)
+    (skin, record, inside), (bare, _, _), (brow, _, _) = (contradicted_plate(some) for some in (None, True, False))
+    assert record["chosen"] == "as the skin around"
+    assert np.array_equal(skin.information, brow.information)
+    assert np.array_equal(skin.albedo, bare.albedo)
+    assert detail_of(brow, inside) > 1.2 * detail_of(skin, inside)
+
+
+def test_held_out_frames_choose_what_contradicted_skin_looks_like():
+    """Its mean where they fit better by it; where no frame contradicts another nothing is chosen by chance."""
+    skin, record, inside = contradicted_plate(True)
+    brow, _, _ = contradicted_plate(False)
+    assert record["chosen"] == "as their mean"
+    assert record["held_out"]["as their mean"] < 0.99 * record["held_out"]["as the skin around"]
+    assert detail_of(skin, inside) == pytest.approx(detail_of(brow, inside), rel=1e-6)
+    _, record, _ = contradicted_plate(wrong=0.0)
+    assert record["chosen"] == "as the skin around"
+    assert record["held_out"]["as their mean"] == pytest.approx(record["held_out"]["as the skin around"], rel=1e-3)
 
 
 def test_borders_of_shadows_that_lie_elsewhere_spoil_little():

@@ -17,7 +17,7 @@ from tools.bench.runner import Table, run
 from tools.bench.stress.bench import StressBench, missing_cases, verdicts
 from tools.bench.stress.camera import Sensor, compressed, defocused, drift, photograph, shaken, smeared
 from tools.bench.stress.perturbations import PERTURBATIONS, Perturbation, StressCase
-from tools.bench.stress.scenes import StressScene, smile_of
+from tools.bench.stress.scenes import StressScene, expressions_of, smile_of
 from tools.bench.stress.subject import mirror_truth, sliding_landmarks, wrong_poses
 from tools.bench.stress.verdict import FAILED, LIMITS, RIGHT, SAID, SILENT, WARNED, judge
 from tools.synthesis.head import head_turn
@@ -146,6 +146,15 @@ def test_poses_and_landmarks_are_off_by_what_the_perturbation_says():
 def test_the_smile_comes_and_goes():
     amount = smile_of(50)
     assert amount[0] == amount[-1] == 0.0 and amount.max() == 1.0 and 0.2 < (amount > 0).mean() < 0.4
+    _, amount = expressions_of(StressScene(long_smile=0.8, frames=50))
+    assert amount[0] == amount[-1] == 0.0 and amount.max() == 0.8 and 0.4 < (amount > 0).mean() < 0.5
+
+
+def test_speech_goes_on_and_comes_back_to_closed_lips():
+    actions, amount = expressions_of(StressScene(speech=0.5, frames=48))
+    assert actions["jaw_open"] > 0 and amount.max() == 0.5
+    assert np.diff(np.nonzero(amount == 0)[0]).max() < 8 and (amount == 0).sum() >= 5
+    assert len(set(amount)) <= 5, "each opening is a head of its own"
 
 
 def row(exit_code=0, warnings=(), missed=(), **worse):

@@ -8,7 +8,6 @@ from shared.imaging.color import decode_srgb
 from tools.scoring.held_out import (
     HeldOutFrame,
     pose_acceleration,
-    reached_end,
     region_errors,
     structural_similarity,
 )
@@ -89,8 +88,3 @@ def test_trembling_poses_and_one_outlier():
 def test_uneven_frames_say_nothing_of_trembling():
     found = pose_acceleration(poses_of(np.arange(4.0), np.full(4, 700.0)), np.array([0, 1, 3, 8]))
     assert np.isnan(list(found.values())).all()
-
-
-@pytest.mark.parametrize(("value", "end"), [(0.1, "lower"), (0.105, "lower"), (0.4, ""), (0.699, "upper"), (0.69, "")])
-def test_a_parameter_at_the_end_of_its_range(value, end):
-    assert reached_end(value, (0.1, 0.7)) == end

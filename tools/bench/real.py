@@ -30,7 +30,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shared.appearance.projection import ROUGHNESS_RANGE, SPECULAR_RANGE
+from shared.appearance.projection import ROUGHNESS_RANGE, SPECULAR_RANGE, reached_end
 from shared.contract.hashing import hash_file
 from shared.contract.pipeline import load_pipeline
 from shared.contract.wording import check_keys, read_yaml, unknown_name
@@ -41,7 +41,7 @@ from tools.bench.real_page import clip_sheet, html_page
 from tools.bench.rerender import SolvedClip
 from tools.bench.runner import Bench, Entry, Table, markdown_table, measured
 from tools.bench.whole_run import code_of, cost_row, detail_row
-from tools.scoring.held_out import pose_acceleration, reached_end, region_errors
+from tools.scoring.held_out import pose_acceleration, region_errors
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".gif")
 TOLD = ("moves", "transfer", "focal_length_px", "focal_length_mm", "sensor_width_mm")

@@ -19,8 +19,6 @@ from shared.imaging.color import LUMINANCE, encode_srgb
 
 SSIM_SIGMA_PX, SSIM_FLOOR = 1.5, (0.01**2, 0.03**2)
 """The window and the two constants of [Wang2004], for values from 0 to 1."""
-NEAR_END = 0.01
-"""Share of its range within which a parameter counts as at the end of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +90,3 @@ def pose_acceleration(camera_from_head: np.ndarray, frame_index: np.ndarray) -> 
         "across_mm": float(np.median(np.linalg.norm(translation[:, :2], axis=1))),
         "depth_mm": float(np.median(np.abs(translation[:, 2]))),
     }
-
-
-def reached_end(value: float, allowed: tuple[float, float]) -> str:
-    """"lower" or "upper" where a value lies within NEAR_END of that end of its allowed range, else ""."""
-    share = (value - allowed[0]) / (allowed[1] - allowed[0])
-    if share < NEAR_END:
-        return "lower"
-    return "upper" if share > 1.0 - NEAR_END else ""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
@@ -38,7 +38,11 @@ TINTS = np.array([[1.0, 0.12, 0.1], [0.1, 0.25, 1.0]])
 """Colours of the light from the left and from the right."""
 SMILE = {"mouth_smile_left": 1.0, "mouth_smile_right": 1.0, "jaw_open": 0.35, "cheek_puff": 0.2}
 SMILE_TIMES = ((0.40, 0.5), (0.44, 1.0), (0.66, 0.5), (0.70, 0.0))
+LONG_SMILE_TIMES = ((0.40, 0.5), (0.44, 1.0), (0.84, 0.5), (0.88, 0.0))
 """From which share of the clip on how much of the smile there is."""
+SPEECH = {"jaw_open": 0.8, "mouth_stretch": 0.3, "mouth_pucker": 0.2}
+SYLLABLE_FRAMES, OPENINGS = 5.3, 4
+"""Frames from one syllable to the next, which no whole number of them makes up, and in how many steps lips part."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,8 @@ class StressScene:
     """light: one of ENVIRONMENTS; on_head: it turns with the head; lamp_mm: how far its lamps stand, 0: far away; tint:
     how coloured the two sides are, 0 to 1.
 
-    tone: melanin; makeup, wet, fringe: shares; glasses_mm, beard_mm: thickness; smile: what comes and goes mid-clip.
+    tone: melanin; makeup, wet, fringe: shares; glasses_mm, beard_mm: thickness; smile: what comes and goes mid-clip;
+    long_smile: the same for almost half of it; speech: how far lips move in all of it.
     """
 
     light: str = "room"
@@ -60,6 +65,8 @@ class StressScene:
     fringe: float = 0.0
     beard_mm: float = 0.0
     smile: float = 0.0
+    long_smile: float = 0.0
+    speech: float = 0.0
     yaw_deg: float = SETTINGS.yaw_deg
     pitch_deg: float = SETTINGS.pitch_deg
     frames: int = SETTINGS.frames
@@ -118,24 +125,38 @@ def render_scene(scene: StressScene, folder: Path, processes: int = 1) -> Path:
     return done
 
 
-def smile_of(frames: int) -> np.ndarray:
+def expressions_of(scene: StressScene) -> tuple[dict[str, float], np.ndarray]:
+    """The facial actions that the scene's expression is made of, and how much of it each frame shows [F]; 0: none."""
+    if scene.speech:
+        return SPEECH, scene.speech * opening_of(scene.frames)
+    times = LONG_SMILE_TIMES if scene.long_smile else SMILE_TIMES
+    return SMILE, (scene.long_smile or scene.smile) * smile_of(scene.frames, times)
+
+
+def smile_of(frames: int, times: Sequence[tuple[float, float]] = SMILE_TIMES) -> np.ndarray:
     """[F] how much of the smile each frame shows."""
     time, amount = np.arange(frames) / frames, np.zeros(frames)
-    for start, value in SMILE_TIMES:
+    for start, value in times:
         amount[time >= start] = value
     return amount
 
 
+def opening_of(frames: int) -> np.ndarray:
+    """[F] how far lips that speak are open in each frame, in steps from 0 to 1."""
+    syllable = np.abs(np.sin(np.pi * np.arange(frames) / SYLLABLE_FRAMES))
+    return np.round(OPENINGS * np.maximum(1.5 * syllable - 0.5, 0.0)) / OPENINGS
+
+
 def _truth_frames(scene: StressScene) -> np.ndarray:
     """Frames that get buffers, evenly spread over those with the face that the mesh has."""
-    still = np.arange(scene.frames) if not scene.smile else np.nonzero(smile_of(scene.frames) == 0)[0]
+    still = np.nonzero(expressions_of(scene)[1] == 0)[0]
     return still[np.unique(np.linspace(0, len(still) - 1, SETTINGS.truth_frames).round().astype(int))]
 
 
 def _states(scene: StressScene) -> Iterator[tuple[Head, Materials, list[int]]]:
     """Heads with their textures and frames: the neutral one first."""
     model = head_model(SETTINGS.level)
-    amount = scene.smile * smile_of(scene.frames)
+    actions, amount = expressions_of(scene)
     neutral = random_head(model, scene.seed, False)
     # Painted once: what the skin shows moves along with it.
     painter = SkinPainter(neutral, SETTINGS.texture, scene.seed)
@@ -145,7 +166,7 @@ def _states(scene: StressScene) -> Iterator[tuple[Head, Materials, list[int]]]:
     if scene.glasses_mm or scene.fringe:
         materials = coloured(materials)
     for value in sorted(set(amount)):
-        head = random_head(model, scene.seed, False, {name: value * part for name, part in SMILE.items()})
+        head = random_head(model, scene.seed, False, {name: value * part for name, part in actions.items()})
         if scene.beard_mm:
             head = with_beard(head, scene.beard_mm, scene.seed)
         if scene.glasses_mm:
