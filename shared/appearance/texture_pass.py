@@ -40,10 +40,11 @@ Result = TypeVar("Result")
 _ALBEDO_PULL = 10.0
 NEIGHBOUR_STEP, SURROUNDINGS_SPREAD = 0.05, 3.0
 """Standard deviations of the log albedo: from one vertex to the next, and from the person's typical skin."""
-CONTRADICTED, LEAST_GAIN = ("as the skin around", "as their mean"), 0.99
-"""What bare texels that frames contradict each other about look like. Under a hard lamp the model is wrong there in all
-frames alike, and the skin around is the better guess; where poses are off, or skin moves, their mean is. Held-out
-frames, in which the mean always fits a little better, have to say so by a hundredth."""
+CONTRADICTED, LEAST_GAIN = ("as the skin around", "as their mean"), 0.98
+"""What bare texels that frames contradict each other about look like, and all whose modelled highlights explain most of
+what they send out. Under a hard lamp the model is wrong there in all frames alike, and the skin around is the better
+guess; where poses are off, skin moves, or a beard is black, their mean is. Held-out frames share the lamp's errors, and
+fit the mean a little better there, too (0.7 %): they have to say so by a fiftieth."""
 FIRST_PASS_FRAMES = 32
 """Enough to tell what a texel looks like, so that every frame's samples can be weighed by it."""
 
@@ -144,13 +145,12 @@ class TexturePass:
             self._share_out(view, partial(self._add, material, part, border, scatter))
         for part, weight in zip(parts, self.light_weights, strict=True):
             part.scale(weight)
-        steady = [error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
-                  + part.highlight_variance(self.specular)
-                  for error, border, part in zip(self.systematic, borders, parts, strict=True)]
-        scattered = [scatter.variance() for scatter in scatters]
-        systematic = [error + ERROR_OVER_SCATTER * scatter for error, scatter in zip(steady, scattered, strict=True)]
-        drawing = [(error + PULL_OVER_SCATTER * self.bare * scatter, error)
-                   for error, scatter in zip(steady, scattered, strict=True)]
+        systematic, drawing = [], []
+        for error, border, part, scatter in zip(self.systematic, borders, parts, scatters, strict=True):
+            lit = error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
+            steady, scattered = lit + part.highlight_variance(self.specular), scatter.variance()
+            systematic.append(steady + ERROR_OVER_SCATTER * scattered)
+            drawing.append((steady + PULL_OVER_SCATTER * self.bare * scattered, lit))
         return weigh_lights(parts, systematic, self.typical_albedo, drawing)
 
     def view(self, f: int) -> FrameView:
@@ -201,7 +201,8 @@ class TexturePass:
         equations, information = evidence.equations, evidence.information
         rough = [equations.solve_albedo(specular, 0.0, 1e-6) for specular in intensities]
         around = self._surroundings(rough, information, fields).astype(np.float32)
-        highlights, found = equations.highlight_variance(self.specular), []
+        dim = np.maximum(evidence.drawing[0] - equations.highlight_variance(self.specular), 0.0)
+        brightest, found = np.maximum(equations.brightest_albedo(dim), LEAST_ALBEDO), []
         for drawing in evidence.drawing:
             pull = _ALBEDO_PULL + equations.ee * (drawing / PRIOR_SPREAD**2)
             own = equations.ee / (equations.ee + pull)
@@ -209,12 +210,11 @@ class TexturePass:
             total = np.maximum(certain.sum(1, keepdims=True), 1e-9)
             believed = (certain * own).sum(1, keepdims=True) / total
             left = np.clip(believed - own, 0.0, 1.0) / np.maximum(1.0 - own, 1e-3)
-            brightest = equations.brightest_albedo(np.maximum(drawing - highlights, 0.0))
             for k, specular in enumerate(intensities):
                 smooth = np.exp(self.surface.interpolate(around[..., k]))
                 brighter = (certain * np.log(np.maximum(rough[k], 1e-3) / smooth)).sum(1, keepdims=True) / total
                 albedo = equations.solve_albedo(specular, smooth * np.exp(brighter * left), pull)
-                albedo = np.minimum(albedo, np.maximum(brightest, LEAST_ALBEDO)).astype(np.float32)
+                albedo = np.minimum(albedo, brightest).astype(np.float32)
                 found.append(TexelMaterial(albedo, specular, information.min(1)))
         return found
 

@@ -153,8 +153,9 @@ _MODEL = (
     Field("model.moves", "What moved against the light: `head` or `camera`.", "text"),
     Field("model.specular_intensity", "The typical specular intensity."),
     Field("model.specular_variation", "How far texels share one specular intensity.", "text"),
-    Field("model.contradicted_texels", "What skin that frames contradict each other about looks like: `as the skin "
-          "around`, or `as their mean` where held-out frames ask for it; empty with solver=reference.", "text"),
+    Field("model.contradicted_texels", "What skin that frames contradict each other about, or that shows little but "
+          "highlights, looks like: `as the skin around`, or `as their mean` where held-out frames ask for it; empty "
+          "with solver=reference.", "text"),
     Field("model.roughness", "The typical roughness."),
     Field("model.roughness_variation", "Whether the roughness varies over the skin, and why; empty where it was not "
           "tried.", ""),
@@ -221,8 +222,8 @@ SOLVE = (
     Field("residuals.texture_held_out", "On the latter after the texture pass, by how far texels share one specular "
           "intensity.", ""),
     Field("residuals.texture_held_out.<width>", "The error."),
-    Field("residuals.contradicted_held_out", "The same by what skin that frames contradict each other about looks "
-          "like; empty with solver=reference.", ""),
+    Field("residuals.contradicted_held_out", "The same by what such skin looks like (model.contradicted_texels); "
+          "empty with solver=reference.", ""),
     Field("residuals.contradicted_held_out.<way>", "The error.", optional=True),
     Field("shape", "What the refinement of the mesh did; absent with solver=reference.", "", optional=True),
     Field("shape.refined", "Whether the refined mesh was kept.", "bool"),

@@ -202,11 +202,11 @@ def test_held_out_frames_choose_what_contradicted_skin_looks_like():
     skin, record, inside = contradicted_plate(True)
     brow, _, _ = contradicted_plate(False)
     assert record["chosen"] == "as their mean"
-    assert record["held_out"]["as their mean"] < 0.99 * record["held_out"]["as the skin around"]
-    assert detail_of(skin, inside) == pytest.approx(detail_of(brow, inside), rel=1e-6)
+    assert record["held_out"]["as their mean"] < 0.98 * record["held_out"]["as the skin around"]
+    assert detail_of(skin, inside) == pytest.approx(detail_of(brow, inside), rel=0.01)
     _, record, _ = contradicted_plate(wrong=0.0)
     assert record["chosen"] == "as the skin around"
-    assert record["held_out"]["as their mean"] == pytest.approx(record["held_out"]["as the skin around"], rel=1e-3)
+    assert record["held_out"]["as their mean"] == pytest.approx(record["held_out"]["as the skin around"], rel=5e-3)
 
 
 def test_borders_of_shadows_that_lie_elsewhere_spoil_little():
