@@ -20,7 +20,8 @@ from shared.tracking.pose_uncertainty import turns_from_mean
 
 LIMIT_MM, JITTERS = 3.0, 7.0
 """Another expression: so far from the common one, and by so many times what the nose's landmarks jitter by from frame
-to frame. Brows that are raised lie 4 to 6 mm higher, corners of a smiling mouth 5 to 10."""
+to frame, of brows what their own do: shadows that a lamp casts from the side take them along. Brows that are raised lie
+4 to 6 mm higher, corners of a smiling mouth 5 to 10."""
 NOSE_OFF_MM = 6.0
 """A nose does not move: where its landmarks lie so far off, up to 4 mm being their bias, the network has missed the
 face, and the others tell nothing of the expression either."""
@@ -140,9 +141,9 @@ def common_expression(
     if len(frames) < LEAST_FRAMES:
         return CommonExpression(shown, away_mm)
     poses = camera_from_head[frames]
-    jitter = ROBUST_SCALE * np.median(np.abs(np.diff(nose[told], axis=0)), axis=0) / np.sqrt(2.0)
-    limit_mm = max(LIMIT_MM, JITTERS * float(jitter.max()))
-    inside, away_mm[frames] = largest_cluster(feature_values(model, offsets), turn_basis(poses), limit_mm)
+    values = feature_values(model, offsets)
+    limits_mm = feature_limits(values, nose[told])
+    inside, away_mm[frames] = largest_cluster(values, turn_basis(poses), limits_mm)
     enough = inside.sum() >= max(LEAST_FRAMES, LEAST_SHARE * len(frames))
     if enough and rotation_range_deg(poses[inside]) >= LEAST_TURN * rotation_range_deg(poses):
         shown[frames] = inside
@@ -168,6 +169,19 @@ def feature_values(model: HeadModel, offsets: np.ndarray) -> np.ndarray:
     return np.stack([offsets[:, feature.axis] @ feature.of(segments, places) for feature in FEATURES], axis=1)
 
 
+def feature_limits(values: np.ndarray, nose: np.ndarray) -> np.ndarray:
+    """[len(FEATURES)] mm by which values [F, len(FEATURES)] mm of one expression differ; nose [F, 2] mm: its offsets.
+    Lips of someone who speaks jitter, too, so that only brows are asked for their own."""
+    limit = max(LIMIT_MM, JITTERS * float(_jitter(nose).max()))
+    brows = np.array(["brow" in feature.name for feature in FEATURES])
+    return np.where(brows, max(limit, JITTERS * float(_jitter(values)[brows].max())), limit)
+
+
+def _jitter(values: np.ndarray) -> np.ndarray:
+    """[K]: standard deviation of values [F, K] about their course, from their steps."""
+    return ROBUST_SCALE * np.median(np.abs(np.diff(values, axis=0)), axis=0) / np.sqrt(2.0)
+
+
 def turn_basis(poses: np.ndarray) -> np.ndarray:
     """[F, 7]: what a landmark's bias may follow: one, then the turn [F, 3] from the mean pose and its squares, each of
     mean 0 and deviation 1."""
@@ -177,8 +191,8 @@ def turn_basis(poses: np.ndarray) -> np.ndarray:
     return np.concatenate([np.ones((len(turn), 1)), varying], axis=1)
 
 
-def largest_cluster(values: np.ndarray, basis: np.ndarray, limit_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Which of the frames [F] bool are the most that are alike in all values [F, K] mm, within limit_mm of their
+def largest_cluster(values: np.ndarray, basis: np.ndarray, limits_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which of the frames [F] bool are the most that are alike in all values [F, K] mm, within limits_mm [K] of their
     middle, and how far each is from it, [F, K] mm; what follows the basis [F, B] does not count."""
     ridge = BIAS_PRIOR * len(values) * np.eye(basis.shape[1])
     ridge[0, 0] = 0.0
@@ -186,11 +200,11 @@ def largest_cluster(values: np.ndarray, basis: np.ndarray, limit_mm: float) -> t
     for _ in range(ROUNDS):
         bias = np.linalg.solve(basis.T @ (weight * basis) + ridge, basis.T @ (weight * values))
         away = values - basis @ bias
-        alike = (np.abs(away[:, None] - away[None]) < limit_mm).all(-1)
+        alike = (np.abs(away[:, None] - away[None]) < limits_mm).all(-1)
         centre = int(alike.sum(1).argmax())
         away = away - np.median(away[alike[centre]], axis=0)
-        inside = (np.abs(away) < limit_mm).all(1)
+        inside = (np.abs(away) < limits_mm).all(1)
         # Frames near the limit pull less: half of them may be on their way to another expression.
-        weight = 1e-3 + inside * (1.0 - np.square(np.clip(np.abs(away) / limit_mm, 0.0, 1.0).max(1)))
+        weight = 1e-3 + inside * (1.0 - np.square(np.clip(np.abs(away) / limits_mm, 0.0, 1.0).max(1)))
         weight = weight[:, None]
     return inside, away
