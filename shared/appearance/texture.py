@@ -143,8 +143,7 @@ class NormalEquations:
         """[T, 3]: an albedo may not send out more than its samples show, highlights or not; variance [T, 3]: of the
         logarithm of the modelled irradiance; infinite where the samples are mostly clipped or none. A black beard under
         the highlights of skin has an albedo that they leave open, but not that of the skin around it."""
-        spared = self.measured_ee / np.maximum(self.measured_ee + self.clipped_ee, 1e-9)
-        told = (self.ee > 1e-6) & (spared > LEAST_UNCLIPPED)
+        told = (self.ee > 1e-6) & (self._spared() > LEAST_UNCLIPPED)
         matt = self.ei / np.maximum(self.ee, 1e-6)
         return np.where(told, matt * np.exp(DEVIATIONS_ABOVE * np.sqrt(variance)), np.inf)
 
@@ -162,8 +161,8 @@ class NormalEquations:
         frames share.
         """
         albedo = self._bounded_albedo(typical_albedo)
-        spared = self.measured_ee / np.maximum(self.measured_ee + self.clipped_ee, 1e-9)
-        return 1.0 / (systematic + CORRELATED_FRAMES / np.maximum(spared**2 * self.measured_ee * albedo**2, 1e-9))
+        measured = np.square(self._spared()) * self.measured_ee
+        return 1.0 / (systematic + CORRELATED_FRAMES / np.maximum(measured * albedo**2, 1e-9))
 
     def shadow_variance(self, typical_albedo: np.ndarray) -> np.ndarray:
         """[T, 3] of the log albedo, since borders of shadows may lie elsewhere: in all frames the same mesh casts
@@ -176,6 +175,10 @@ class NormalEquations:
         gives a skin's specular intensity."""
         share = np.reshape(specular, (-1, 1)) * self.es / np.maximum(self.ei, 1e-9)
         return np.square(HIGHLIGHT_ERROR * share / np.maximum(1.0 - share, LEAST_MATTE_SHARE))
+
+    def _spared(self) -> np.ndarray:
+        """[T, 3]: share of the samples that is not clipped, by EE."""
+        return self.measured_ee / np.maximum(self.measured_ee + self.clipped_ee, 1e-9)
 
     def _bounded_albedo(self, typical_albedo: np.ndarray) -> np.ndarray:
         return np.minimum(self.ei / np.maximum(self.ee, 1e-6), typical_albedo)

@@ -6,22 +6,12 @@ import numpy as np
 import pytest
 from shapes import nods
 
-from shared.errors import InputError
 from shared.geometry.transforms import project, rotation_from_vector
 from shared.tracking.expression import FEATURES, common_expression, largest_cluster, turn_basis
-from shared.tracking.models import load_head_model
 
 LENS = np.array([[2700.0, 0, 400], [0, 2700.0, 400], [0, 0, 1]])
 FRAMES = 60
 TURN_DEG = 30.0 * np.sin(np.linspace(0, 2 * np.pi, FRAMES))
-
-
-@pytest.fixture(scope="module")
-def model():
-    try:
-        return load_head_model()
-    except InputError as error:
-        pytest.skip(f"the head model is not set up: {error}")
 
 
 def seen(model, poses, activations, slide=0.0, noise_px=0.5):

@@ -7,21 +7,11 @@ from scipy.spatial import cKDTree
 from toy_head import toy_head
 
 from shared.capture.landmarks import BROW_LEFT, BROW_RIGHT, CHIN, EYE_CORNERS_LEFT, EYE_CORNERS_RIGHT, OVAL
-from shared.errors import InputError
 from shared.geometry.mesh import Mesh, interpolate, midpoint_subdivision, rasterize_uv, vertex_normals
 from shared.geometry.raycast import RayScene
 from shared.tracking.head_model import HeadModel, child_location, parent_location
-from shared.tracking.models import load_head_model
 
 INTERPUPILLARY_MM = 63.0
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    try:
-        return load_head_model()
-    except InputError as error:
-        pytest.skip(f"the head model is not set up: {error}")
 
 
 def _face_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
