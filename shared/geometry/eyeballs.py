@@ -1,0 +1,80 @@
+"""Where the eyeballs are in a head's mesh, and how they turn: gaze as yaw and pitch in head space.
+
+Gaze [..., 2] is in radians: yaw towards +x (the viewer's right), pitch towards +y (up), both 0 straight ahead along +z.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.geometry.surface import Surface
+
+SIDES = ("right", "left")
+"""Of the head itself; the right eye is on the side of -x. Whatever holds both eyes has them in this order."""
+
+
+@dataclass(frozen=True, eq=False)
+class Eyeball:
+    """A part of the mesh that is close to a sphere: vertices [n] and faces [m] int of that mesh, centre [3] and radius
+    in mm."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    centre: np.ndarray
+    radius: float
+
+    def turned(self, points: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """Points [N, 3] on the eyeball as it looks straight ahead -> where they are with the rotation [3, 3] of its
+        gaze, mm."""
+        return (points - self.centre) @ rotation.T + self.centre
+
+
+def eyeballs_of(surface: Surface) -> tuple[Eyeball, Eyeball] | None:
+    """The right and the left eyeball of a head; None where the mesh has no segment `eyes`, or not one on each side."""
+    if surface.face_segment is None or "eyes" not in surface.segment_names:
+        return None
+    faces = np.nonzero(surface.faces_of(("eyes",)))[0]
+    corners = surface.mesh.faces[faces]
+    right = surface.mesh.vertices[corners[:, 0], 0] < 0
+    if not right.any() or right.all():
+        return None
+    return tuple(_eyeball(surface.mesh.vertices, corners[own], faces[own]) for own in (right, ~right))
+
+
+def _eyeball(vertices: np.ndarray, corners: np.ndarray, faces: np.ndarray) -> Eyeball:
+    own = np.unique(corners)
+    centre, radius = fit_sphere(vertices[own])
+    return Eyeball(own, faces, centre, radius)
+
+
+def fit_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre [3] and radius of the sphere nearest to points [N, 3] in the algebraic sense: 2 c x + r^2 - c^2 = x^2."""
+    middle = points.mean(0)
+    around = points - middle
+    system = np.column_stack([2.0 * around, np.ones(len(around))])
+    *centre, rest = np.linalg.lstsq(system, np.square(around).sum(1), rcond=None)[0]
+    return middle + centre, float(np.sqrt(rest + np.dot(centre, centre)))
+
+
+def gaze_direction(gaze: np.ndarray) -> np.ndarray:
+    """Gaze [..., 2] -> unit directions [..., 3] in head space."""
+    yaw, pitch = gaze[..., 0], gaze[..., 1]
+    return np.stack([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)], axis=-1)
+
+
+def gaze_towards(direction: np.ndarray) -> np.ndarray:
+    """Directions [..., 3] in head space, of any length -> gaze [..., 2]; the inverse of gaze_direction."""
+    x, y, z = np.moveaxis(direction, -1, 0)
+    return np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1)
+
+
+def gaze_rotation(gaze: np.ndarray) -> np.ndarray:
+    """Gaze [..., 2] -> [..., 3, 3], which turns +z to it: pitch about x, then yaw about y. Eyes roll by less than these
+    angles say (Listing's law), which a centred iris does not show."""
+    yaw, pitch = gaze[..., 0], gaze[..., 1]
+    sy, cy, sp, cp = np.sin(yaw), np.cos(yaw), np.sin(pitch), np.cos(pitch)
+    zero = np.zeros_like(yaw)
+    rows = [[cy, -sy * sp, sy * cp], [zero, cp, sp], [-sy, -cy * sp, cy * cp]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
