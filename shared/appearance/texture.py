@@ -28,6 +28,9 @@ CORRELATED_FRAMES = 6.0
 
 PRIOR_SPREAD = 0.3
 """Standard deviation of a texel's log albedo if all one knew were the person's mean."""
+DEGREES, DRAWING_STEPS = 9.0, 4
+"""Degrees of freedom of a texel's log albedo about its surroundings: most follow them, a mole, a hair or the edge of
+a beard leaves them by far. So many steps find how far."""
 
 IRRADIANCE_ERROR = 0.03
 """Error of the modelled irradiance, relative to the face's mean: bounces, visibility and shape are so good at best.
@@ -138,6 +141,21 @@ class NormalEquations:
         """Albedo [T, 3] for given specular [T]; fallback [T, 3] acts with precision pull, a number or [T, 3]."""
         moment = self.ei - specular[:, None] * self.es
         return np.clip((moment + pull * fallback) / (self.ee + pull), LEAST_ALBEDO, 1.0).astype(np.float32)
+
+    def drawn_albedo(
+        self, specular: np.ndarray, around: np.ndarray, pull: float, variance: np.ndarray
+    ) -> np.ndarray:
+        """Albedo [T, 3] for given specular [T], between what the samples say and the albedo around [T, 3].
+
+        The samples say its logarithm with variance [T, 3], however many they are; about the logarithm around them it
+        has Student's t distribution in the three channels together. Its mode is that of a normal prior of variance
+        PRIOR_SPREAD^2 + |x|^2 / (DEGREES + 3) for a texel that is off by x [3] ([Lange1989], section 2). pull:
+        precision of the albedo around beside the samples', so that texels without any have it.
+        """
+        albedo = self.solve_albedo(specular, around, pull)
+        numbers = np.array([PRIOR_SPREAD**2, DEGREES], np.float32)
+        _draw(albedo, np.maximum(around, LEAST_ALBEDO).astype(np.float32), variance.astype(np.float32), numbers)
+        return albedo
 
     def brightest_albedo(self, variance: np.ndarray) -> np.ndarray:
         """[T, 3]: an albedo may not send out more than its samples show, highlights or not; variance [T, 3]: of the
@@ -272,6 +290,22 @@ class ScatterSums:
         squared, along, power, weight = (self.sums[:, 3 * k : 3 * k + 3] for k in range(4))
         power = np.maximum(power, 1e-6)
         return np.maximum(squared - along**2 / power - weight, 0.0) / power
+
+
+@compiled
+def _draw(albedo, around, variance, numbers):
+    spread, degrees = numbers
+    left = np.empty(3, np.float32)
+    for i in range(len(albedo)):
+        squared = np.float32(0.0)
+        for _ in range(DRAWING_STEPS + 1):
+            prior = spread + squared / (degrees + np.float32(3.0))
+            squared = np.float32(0.0)
+            for c in range(3):
+                left[c] = prior / (prior + variance[i, c]) * np.log(albedo[i, c] / around[i, c])
+                squared += left[c] * left[c]
+        for c in range(3):
+            albedo[i, c] = min(around[i, c] * np.exp(left[c]), np.float32(1.0))
 
 
 @compiled

@@ -213,7 +213,7 @@ class TexturePass:
             for k, specular in enumerate(intensities):
                 smooth = np.exp(self.surface.interpolate(around[..., k]))
                 brighter = (certain * np.log(np.maximum(rough[k], 1e-3) / smooth)).sum(1, keepdims=True) / total
-                albedo = equations.solve_albedo(specular, smooth * np.exp(brighter * left), pull)
+                albedo = equations.drawn_albedo(specular, smooth * np.exp(brighter * left), _ALBEDO_PULL, drawing)
                 albedo = np.minimum(albedo, brightest).astype(np.float32)
                 found.append(TexelMaterial(albedo, specular, information.min(1)))
         return found

@@ -55,6 +55,9 @@ REFERENCES = {
     "Laine2020": "Laine et al., Modular Primitives for High-Performance Differentiable Rendering. SIGGRAPH Asia 2020.",
     "Lam1985": "Lam, Metamerism and Colour Constancy. PhD thesis, University of Bradford, 1985.",
     "Lam2015": "Lam, Pitrou, Seibert, Numba: a LLVM-based Python JIT compiler. LLVM-HPC 2015.",
+    "Lange1989":
+        "Lange, Little, Taylor, Robust Statistical Modeling Using the t Distribution. Journal of the American "
+        "Statistical Association 84, 1989.",
     "Lepetit2009":
         "Lepetit, Moreno-Noguer, Fua, EPnP: An Accurate O(n) Solution to the PnP Problem. International Journal of "
         "Computer Vision 81, 2009.",

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 from shapes import grid_plane
 
 from shared.appearance.texture import (
+    DEGREES,
     LEAST_BORDER_MM,
     PRIOR_SPREAD,
     BorderSums,
@@ -64,6 +66,25 @@ def test_albedo_is_weighted_least_squares():
             right = colours[:, t, c] - specular[t] * reflection[:, t, c]
             expected = np.linalg.lstsq((root * irradiance[:, t, c])[:, None], root * right, rcond=None)[0][0]
             assert found[t, c] == pytest.approx(np.clip(expected, 0.002, 1.0), abs=1e-4)
+
+
+def test_a_texel_is_drawn_to_the_mode_of_students_t():
+    """The nearer to its surroundings the more, and never past its samples: as a search for the mode finds it."""
+    frames = random_frames(12)
+    equations, specular, rng = accumulated(*frames), np.full(12, 0.3), np.random.default_rng(1)
+    told = equations.solve_albedo(specular, np.zeros((12, 3)), 1e-6)
+    around = told * np.exp(rng.normal(size=(12, 1)) * np.linspace(0.1, 1.5, 12)[:, None])
+    variance = rng.uniform(0.0, 0.3, (12, 3))
+    found = equations.drawn_albedo(specular, around, 1e-6, variance)
+
+    def badness(off, t):
+        error = np.log(told[t] / around[t]) - off
+        return np.sum(error**2 / variance[t]) + (DEGREES + 3) * np.log1p(off @ off / (PRIOR_SPREAD**2 * (DEGREES + 3)))
+
+    for t in range(12):
+        expected = around[t] * np.exp(minimize(badness, np.zeros(3), (t,)).x)
+        np.testing.assert_allclose(found[t], np.minimum(expected, 1.0), rtol=0.02)
+    np.testing.assert_allclose(equations.drawn_albedo(specular, around, 1e-6, np.zeros((12, 3))), told, rtol=1e-4)
 
 
 def test_intensity_is_joint_least_squares_with_albedo():
