@@ -56,9 +56,9 @@ class FaceNetworks:
 
     def __init__(self, detector_path: Path, landmarks_path: Path, person_mask_path: Path) -> None:
         """Load the three .tflite files; InputError where OpenCV cannot read one."""
-        self._detector = _load(detector_path)
-        self._landmarks = _load(landmarks_path)
-        self._person_mask = _load(person_mask_path)
+        self._detector = load_network(detector_path)
+        self._landmarks = load_network(landmarks_path)
+        self._person_mask = load_network(person_mask_path)
         self._anchors = _ssd_anchors()
 
     def detect(self, rgb: np.ndarray, min_score: float = 0.5, zoom: bool = True) -> list[Detection]:
@@ -139,7 +139,7 @@ class FaceNetworks:
         """
         height, width = rgb.shape[:2]
         small = cv2.resize(rgb, (MASK_SIZE, MASK_SIZE), interpolation=cv2.INTER_AREA)
-        (mask,) = _forward(self._person_mask, small.astype(np.float32) / 255, (MASK_SIZE * MASK_SIZE,))
+        (mask,) = run_network(self._person_mask, small.astype(np.float32) / 255, (MASK_SIZE * MASK_SIZE,))
         mask = mask.reshape(MASK_SIZE, MASK_SIZE)
         return cv2.resize(mask, (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 1)
 
@@ -155,7 +155,7 @@ class FaceNetworks:
         padded = np.zeros((DETECTOR_SIZE, DETECTOR_SIZE, 3), np.float32)
         top, left = (DETECTOR_SIZE - part.shape[0]) // 2, (DETECTOR_SIZE - part.shape[1]) // 2
         padded[top : top + part.shape[0], left : left + part.shape[1]] = part / 127.5 - 1
-        boxes, logits = _forward(self._detector, padded, (896 * 16, 896))
+        boxes, logits = run_network(self._detector, padded, (896 * 16, 896))
         scores = _sigmoid(logits)
         found = []
         for i in np.nonzero(scores >= min_score)[0]:
@@ -171,8 +171,8 @@ class FaceNetworks:
         # cv2 counts pixel centres from 0.0, we from 0.5: shift on both sides.
         warp = image_from_crop.copy()
         warp[:, 2] += warp[:, :2] @ (0.5, 0.5) - 0.5
-        crop = _warped(rgb, warp, LANDMARK_SIZE)
-        values, logit = _forward(self._landmarks, crop, (LANDMARK_COUNT * 3, 1))
+        crop = warped(rgb, warp, LANDMARK_SIZE)
+        values, logit = run_network(self._landmarks, crop, (LANDMARK_COUNT * 3, 1))
         points = values.reshape(LANDMARK_COUNT, 3).astype(np.float64)
         scale = float(np.sqrt(np.linalg.det(image_from_crop[:, :2])))
         points[:, :2] = points[:, :2] @ image_from_crop[:, :2].T + image_from_crop[:, 2]
@@ -180,7 +180,7 @@ class FaceNetworks:
         return float(_sigmoid(logit)[0]), points
 
 
-def _warped(rgb: np.ndarray, image_from_crop: np.ndarray, size: int) -> np.ndarray:
+def warped(rgb: np.ndarray, image_from_crop: np.ndarray, size: int) -> np.ndarray:
     """float32 [size, size, 3] in [0, 1]: the picture (uint8) under an affine map [2, 3] of integer-centred pixels.
 
     In floating point: 8-bit results round the other way on other processors, which moves landmarks by 0.01 px.
@@ -194,7 +194,8 @@ def _warped(rgb: np.ndarray, image_from_crop: np.ndarray, size: int) -> np.ndarr
     return cv2.warpAffine(part, part_from_crop, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
 
-def _load(path: Path) -> cv2.dnn.Net:
+def load_network(path: Path) -> cv2.dnn.Net:
+    """A .tflite file as a network; InputError where OpenCV cannot read it."""
     try:
         return cv2.dnn.readNetFromTFLite(str(path), cv2.dnn.ENGINE_CLASSIC)
     except cv2.error as error:
@@ -207,7 +208,7 @@ def _load(path: Path) -> cv2.dnn.Net:
         ) from error
 
 
-def _forward(net: cv2.dnn.Net, image: np.ndarray, sizes: tuple[int, ...]) -> list[np.ndarray]:
+def run_network(net: cv2.dnn.Net, image: np.ndarray, sizes: tuple[int, ...]) -> list[np.ndarray]:
     """Run a network on a float32 [H, W, 3] image; outputs, flattened, in the order of the element counts
     `sizes`.
     """

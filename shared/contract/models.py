@@ -9,8 +9,10 @@ NETWORK_FILES = {
     "face_detector": "face_detection_short_range.tflite",
     "face_landmarks": "face_landmark.tflite",
     "person_mask": "selfie_segmentation.tflite",
+    "iris": "iris_landmark.tflite",
 }
-FACE_NETWORKS = tuple(NETWORK_FILES.values())
+FACE_NETWORKS = tuple(NETWORK_FILES[name] for name in ("face_detector", "face_landmarks", "person_mask"))
+IRIS_NETWORK = NETWORK_FILES["iris"]
 HEAD_MODEL_FILE = "head_model.npz"
 
 

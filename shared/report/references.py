@@ -1,6 +1,9 @@
 """The literature that docstrings and comments cite as [Key], and the methods text as {Key}: docs/bibliography.md."""
 
 REFERENCES = {
+    "Ablavatski2020":
+        "Ablavatski et al., Real-time Pupil Tracking from Monocular Video for Digital Puppetry. arXiv 2006.11341, "
+        "2020.",
     "Arvo1994": "Arvo, The Irradiance Jacobian for Partially Occluded Polyhedral Sources. SIGGRAPH 1994.",
     "Baker2004":
         "Baker, Matthews, Lucas-Kanade 20 Years On: A Unifying Framework. International Journal of Computer Vision "

@@ -1,4 +1,4 @@
-"""Where set-up leaves the face networks and the head model, and how a stage reads them.
+"""Where set-up leaves the networks of face and iris and the head model, and how a stage reads them.
 
 Its `models.json` lists each file with SHA-256, source and licence; a file is read only if its hash is the listed one.
 A stage that reads a model declares it: its hash is in the stage's manifest.
@@ -11,6 +11,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from shared.capture.iris import IrisNetwork
 from shared.capture.landmarks import FaceNetworks
 from shared.contract.models import HEAD_MODEL_FILE, NETWORK_FILES, models_folder
 from shared.errors import InputError
@@ -24,12 +25,12 @@ _HINT = "run make setup"
 
 
 def network_path(name: str) -> Path:
-    """Path of one network: face_detector, face_landmarks or person_mask. InputError where missing or damaged."""
+    """Path of one network: face_detector, face_landmarks, person_mask or iris. InputError where missing or damaged."""
     return checked_path(NETWORK_FILES[name])
 
 
 def load_face_networks() -> FaceNetworks:
-    """The three networks, ready to run."""
+    """The three networks of the face, ready to run."""
     return FaceNetworks(*(network_path(name) for name in ("face_detector", "face_landmarks", "person_mask")))
 
 
@@ -44,6 +45,14 @@ def own_face_networks() -> FaceNetworks:
         with _one_at_a_time:
             _of_thread.networks = load_face_networks()
     return _of_thread.networks
+
+
+def own_iris_network() -> IrisNetwork:
+    """The network of the iris of the calling thread, loaded at its first call. InputError where missing or damaged."""
+    if not hasattr(_of_thread, "iris"):
+        with _one_at_a_time:
+            _of_thread.iris = IrisNetwork(network_path("iris"))
+    return _of_thread.iris
 
 
 def load_head_model() -> HeadModel:

@@ -41,7 +41,9 @@ class TestModelsFolder:
 
     def test_each_file_is_listed_with_hash_source_and_licence(self, copy):
         listed = json.loads((copy / LIST_FILE).read_text())["models"]
-        assert {entry["name"] for entry in listed} == {"face_detector", "face_landmarks", "person_mask", "head_model"}
+        assert {entry["name"] for entry in listed} == {
+            "face_detector", "face_landmarks", "person_mask", "iris", "head_model"
+        }
         for entry in listed:
             assert len(entry["sha256"]) == 64 and "package index" in entry["source"] and entry["licence"]
 
@@ -59,6 +61,16 @@ class TestModelsFolder:
         assert not models.is_complete(copy)
         with pytest.raises(InputError, match="face_landmark.tflite: the models are not set up.*run make setup"):
             network_path("face_landmarks")
+
+    def test_an_installation_without_the_iris_network_is_incomplete(self, copy):
+        """As an older version leaves it: neither the file nor its entry in the list."""
+        (copy / "iris_landmark.tflite").unlink()
+        content = json.loads((copy / LIST_FILE).read_text())
+        content["models"] = [entry for entry in content["models"] if entry["name"] != "iris"]
+        (copy / LIST_FILE).write_text(json.dumps(content))
+        assert not models.is_complete(copy)
+        with pytest.raises(InputError, match="iris_landmark.tflite: the models are not set up.*run make setup"):
+            network_path("iris")
 
     def test_a_list_cut_short_is_noticed(self, copy):
         (copy / LIST_FILE).write_text('{"models": [')

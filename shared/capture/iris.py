@@ -1,0 +1,75 @@
+"""Irises and lids in a picture: five points of each iris, sixteen of the lids' margins.
+
+The network is MediaPipe's Iris (Apache-2.0), run through OpenCV's dnn module. It sees a square between the eye's
+corners, turned level and 2.3 times as wide as they are apart, as MediaPipe's graph cuts it out; it was made for one
+eye, so that the other is mirrored.
+
+Reference: [Ablavatski2020].
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from shared.capture.landmarks import EYE_CORNERS_LEFT, EYE_CORNERS_RIGHT, load_network, run_network, warped
+
+EYE_SIZE = 64
+EYE_ENLARGEMENT = 2.3
+LEAST_WIDTH_PX = 6.0
+"""Between the corners of an eye: what is seen from so far to the side, or so small, shows no iris."""
+
+CONTOUR_COUNT, LID_COUNT = 71, 16
+LOWER_LID, UPPER_LID = tuple(range(9)), (0, 9, 10, 11, 12, 13, 14, 15, 8)
+"""Positions among the points of the lids, each from the outer to the inner corner; both lids end in the corners."""
+
+
+class EyePoints(NamedTuple):
+    """iris [5, 2] px: centre, then the rim towards the inner corner, above, towards the outer corner and below; lids
+    [16, 2] px, see LOWER_LID and UPPER_LID. Pixel centres at +0.5."""
+
+    iris: np.ndarray
+    lids: np.ndarray
+
+
+class IrisNetwork:
+    """The network, loaded once; pictures are uint8 [H, W, 3] RGB, points are px with centres at +0.5."""
+
+    def __init__(self, path: Path) -> None:
+        """Load the .tflite file; InputError where OpenCV cannot read it."""
+        self._network = load_network(path)
+
+    def eyes(self, rgb: np.ndarray, landmarks_px: np.ndarray) -> tuple[EyePoints | None, EyePoints | None]:
+        """The subject's right and left eye, each None where the face hides it; landmarks_px [468, >=2] px of the
+        face."""
+        right, left = (landmarks_px[list(corners), :2] for corners in (EYE_CORNERS_RIGHT, EYE_CORNERS_LEFT))
+        return self.eye(rgb, right), self.eye(rgb, left, left=True)
+
+    def eye(self, rgb: np.ndarray, corners: np.ndarray, left: bool = False) -> EyePoints | None:
+        """Points of the eye with the corners [2, 2] px, outer then inner; None where they are hardly apart. left: of
+        the subject."""
+        image_from_crop = crop_of_eye(corners, left)
+        if image_from_crop is None:
+            return None
+        # cv2 counts pixel centres from 0.0, we from 0.5: shift on both sides.
+        warp = image_from_crop.copy()
+        warp[:, 2] += warp[:, :2] @ (0.5, 0.5) - 0.5
+        iris, contours = run_network(self._network, warped(rgb, warp, EYE_SIZE), (15, 3 * CONTOUR_COUNT))
+        points = np.concatenate([iris.reshape(5, 3), contours.reshape(CONTOUR_COUNT, 3)[:LID_COUNT]])[:, :2]
+        points = points.astype(np.float64) @ image_from_crop[:, :2].T + image_from_crop[:, 2]
+        return EyePoints(points[:5], points[5:])
+
+
+def crop_of_eye(corners: np.ndarray, left: bool = False) -> np.ndarray | None:
+    """Affine map [2, 3] from the 64 px crop to the picture, px: the crop's +x runs from the outer to the inner corner
+    [2, 2], as it does in a right eye, its +y down the face: a left eye is mirrored. None where the corners are hardly
+    apart."""
+    inward = corners[1] - corners[0]
+    width = float(np.hypot(*inward))
+    if not width >= LEAST_WIDTH_PX:
+        return None
+    down = np.array([-inward[1], inward[0]]) * (-1.0 if left else 1.0)
+    linear = np.column_stack([inward, down]) * (EYE_ENLARGEMENT / EYE_SIZE)
+    return np.column_stack([linear, corners.mean(0) - linear @ np.full(2, EYE_SIZE / 2)])
