@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from shared.contract import Job, Output, Parameter, Stage, main
-from shared.contract.models import FACE_NETWORKS, HEAD_MODEL_FILE
+from shared.contract.models import FACE_NETWORKS, HEAD_MODEL_FILE, IRIS_NETWORK
 from shared.contract.records import LANDMARKS, MESH, TRACKED_POSES, TRACKING, TRACKS
 
 STAGE = Stage(
@@ -24,11 +24,13 @@ STAGE = Stage(
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
     given=("landmarks", "poses"),
-    models=(*FACE_NETWORKS, HEAD_MODEL_FILE),
+    models=(*FACE_NETWORKS, IRIS_NETWORK, HEAD_MODEL_FILE),
     outputs=(
-        Output("poses.npz", "the head's pose in each frame, its covariance, the lens", unit="mm", fields=TRACKED_POSES),
+        Output("poses.npz", "the head's pose in each frame, its covariance, the gaze, the lens", unit="mm",
+               fields=TRACKED_POSES),
         Output("mesh.npz", "the fitted head with its UVs and face segments", unit="mm", space="head", fields=MESH),
-        Output("landmarks.npz", "the 468 landmarks of each used frame", unit="px", space="crop", fields=LANDMARKS),
+        Output("landmarks.npz", "the 468 landmarks of each used frame, irises and lids", unit="px", space="crop",
+               fields=LANDMARKS),
         Output("tracks.npz", "track points on the skin, their errors in pixels and in depth", unit="mm", space="head",
                fields=TRACKS),
         Output("tracking.json", "residuals, rotation range, excluded frames with their reasons, warnings",
@@ -54,41 +56,49 @@ STAGE = Stage(
         Parameter("stiffness", float, 20.0, "Stiffness of the free shape, per noise over relief.", "", 0.01, 1e6),
         Parameter("min_confidence", float, 0.5, "Landmark network's confidence below which a frame is lost.", "", 0, 1,
                   former="least_presence"),
+        Parameter("eyes", bool, True, "Find gaze and blinks."),
         Parameter("outlier_factor", float, 4.0, "Frames that fit so many times worse are left out.", "", 1.5, 100.0),
     ),
 )
 
 
 def look_at_frames(job: Job, frames):
-    """Each frame read once -> landmarks [F, 468, 2] px and presence [F], by the networks or of the given file, and the
-    F grey frames that the pictures for tracking are made of."""
+    """Each frame read once -> landmarks [F, 468, 2] px and presence [F], by the networks or of the given file, the F
+    grey frames that the pictures for tracking are made of, and the eyes of each frame, None without `eyes`."""
+    from shared.capture.iris import SeenEyes
     from shared.compute.parallel import in_order
     from shared.imaging.color import eight_bit
     from shared.tracking.given_tracking import read_given_landmarks
-    from shared.tracking.models import own_face_networks
+    from shared.tracking.models import own_face_networks, own_iris_network
     from shared.tracking.tracked_clip import GreyFrame
 
     given, points, presence = job.subject.landmarks, np.zeros((frames.count, 468, 2)), np.zeros(frames.count)
     if given is not None:
         points, is_given = read_given_landmarks(given, frames.frame_index, frames.crop)
         presence = is_given.astype(float)
-    least, greys, previous = job.params.min_confidence, [], None
+    least, greys, eyes, previous = job.params.min_confidence, [], [], None
+
+    def eyes_in(rgb: np.ndarray, landmarks_px: np.ndarray | None):
+        return own_iris_network().eyes(rgb, landmarks_px) if job.params.eyes and landmarks_px is not None else None
 
     def look(i: int):
         rgb = eight_bit(frames.read_codes(i))
         found = own_face_networks().find_alone(rgb, least) if given is None else None
-        return GreyFrame.of(rgb, frames.read_mask(i) == 0), found
+        named = points[i] if presence[i] > 0 else None
+        return GreyFrame.of(rgb, frames.read_mask(i) == 0), found, eyes_in(rgb, named if found is None else found[1])
 
-    for i, (grey, found) in enumerate(in_order(look, job.progress(range(frames.count), "landmarks"))):
+    for i, (grey, found, seen) in enumerate(in_order(look, job.progress(range(frames.count), "landmarks"))):
         greys.append(grey)
-        if given is not None:
-            continue
-        if found is None:
-            found = own_face_networks().find(eight_bit(frames.read_codes(i)), previous, least)
-        presence[i], previous = found
-        if previous is not None:
-            points[i] = previous[:, :2]
-    return points, presence, greys
+        if given is None:
+            if found is None:
+                rgb = eight_bit(frames.read_codes(i))
+                found = own_face_networks().find(rgb, previous, least)
+                seen = eyes_in(rgb, found[1])
+            presence[i], previous = found
+            if previous is not None:
+                points[i] = previous[:, :2]
+        eyes.append(seen)
+    return points, presence, greys, SeenEyes.of(eyes) if job.params.eyes else None
 
 
 def build_clip(job: Job, frames, greys: list, used: np.ndarray, landmarks_px: np.ndarray, given_poses):
@@ -150,9 +160,9 @@ def excluded_frames(frames, used: np.ndarray, presence: np.ndarray, reasons: lis
     return excluded
 
 
-def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[dict], common) -> dict:
+def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[dict], common, eyes: dict) -> dict:
     """tracking.json; its warnings also go to the log. fits [F] bool: frames that got a pose; common: their
-    expression."""
+    expression; eyes: what is said of them."""
     from shared.geometry.transforms import rotation_range_deg
     from shared.tracking.track_quality import rotation_deviation_deg, warnings_of
 
@@ -189,12 +199,14 @@ def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[d
         "scale": "fixed by the head model's mean size and identity prior",
         "identity": [round(float(code), 4) for code in track.fit.identity],
         "expression": [round(float(code), 4) for code in track.fit.expression],
+        **eyes,
     }
 
 
-def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> None:
+def publish(job: Job, frames, model, used, landmarks_px, presence, seen, track) -> None:
     """Writes all outputs."""
     from shared.geometry.mesh import Mesh
+    from shared.geometry.surface import Surface
     from shared.imaging.color import eight_bit
     from shared.io.arrays import save_arrays, write_json
     from shared.io.images import write_png
@@ -202,6 +214,7 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
     from shared.report.tracking_pictures import overlay_strip, pose_curves, residual_map
     from shared.tracking.bundle import zoomed
     from shared.tracking.expression import common_expression
+    from shared.tracking.eyes import track_eyes
     from shared.tracking.first_poses import choose_references
     from shared.tracking.track_quality import frames_that_fit
 
@@ -214,6 +227,10 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
     fits = fits & common.shown
     reasons = [reason or common.reason(k) for k, reason in enumerate(reasons)]
     kept, poses, covariance = used[fits], track.camera_from_head[fits], track.covariance[fits]
+    mesh = Mesh(track.fit.vertices, model.faces, model.uvs, model.face_uvs)
+    surface, eyes = Surface(mesh, model.face_segment, model.segment_names), None
+    if seen is not None:
+        eyes = track_eyes(surface, seen.subset(kept), poses, lens, frames.time_s[kept])
     save_arrays(
         job.out / "poses.npz",
         camera_from_head=poses,
@@ -221,23 +238,25 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, track) -> Non
         frame_index=frames.frame_index[kept],
         intrinsics=zoomed(frames.intrinsics_source, gain),
         intrinsics_crop=lens,
+        **({} if eyes is None else eyes.pose_arrays),
     )
-    mesh = Mesh(track.fit.vertices, model.faces, model.uvs, model.face_uvs)
     save_mesh(job.out / "mesh.npz", mesh, face_segment=model.face_segment)
     save_arrays(
         job.out / "landmarks.npz",
         landmarks_px=landmarks_px[kept],
         presence=presence[kept],
         frame_index=frames.frame_index[kept],
+        **({} if eyes is None else eyes.landmark_arrays),
     )
     residual = np.nanmedian(track.error_px[fits], axis=0)
     save_arrays(job.out / "tracks.npz", points_head=track.points_head, residual_px=residual, sigma_mm=track.sigma_mm)
     excluded = excluded_frames(frames, used, presence, reasons)
-    write_json(job.out / "tracking.json", summarise(job, frames, model, track, fits, excluded, common))
-    chosen = choose_references(poses, 5)
+    said = {} if eyes is None else {"eyes": eyes.record(frames.frame_index[kept])}
+    write_json(job.out / "tracking.json", summarise(job, frames, model, track, fits, excluded, common, said))
+    chosen, gaze = choose_references(poses, 5), None if eyes is None else eyes.gaze
     pictures = [eight_bit(frames.read_codes(i)) for i in kept[chosen]]
     write_png(job.out / "overlay.png", overlay_strip(pictures, mesh, poses[chosen], lens, landmarks_px[kept[chosen]]))
-    write_png(job.out / "curves.png", pose_curves(poses, covariance, frames.time_s[kept]))
+    write_png(job.out / "curves.png", pose_curves(poses, covariance, frames.time_s[kept], gaze))
     write_png(job.out / "residuals.png", residual_map(mesh, track.points_head, residual))
 
 
@@ -262,7 +281,7 @@ def run(job: Job) -> None:
     frames = FrameSet.open(job.input("sample_frames"))
     with ThreadPoolExecutor(1) as beside:
         loading = beside.submit(load_solver)
-        landmarks_px, presence, greys = look_at_frames(job, frames)
+        landmarks_px, presence, greys, seen = look_at_frames(job, frames)
         model = loading.result()
     from shared.tracking.track_head import track_head
 
@@ -281,7 +300,7 @@ def run(job: Job) -> None:
         )
     clip = build_clip(job, frames, greys, used, landmarks_px, given_poses)
     track = track_head(clip, model, read_settings(job, frames.focal_known), job.progress, job.note)
-    publish(job, frames, model, used, landmarks_px, presence, track)
+    publish(job, frames, model, used, landmarks_px, presence, seen, track)
 
 
 def check(job: Job) -> None:

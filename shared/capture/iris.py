@@ -9,6 +9,7 @@ Reference: [Ablavatski2020].
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,6 +33,29 @@ class EyePoints(NamedTuple):
 
     iris: np.ndarray
     lids: np.ndarray
+
+
+@dataclass(frozen=True)
+class SeenEyes:
+    """iris_px [F, 2, 5, 2] and lids_px [F, 2, 16, 2] px of the right and left eye, see EyePoints; NaN where an eye is
+    not seen."""
+
+    iris_px: np.ndarray
+    lids_px: np.ndarray
+
+    @classmethod
+    def of(cls, frames: list[tuple[EyePoints | None, EyePoints | None] | None]) -> SeenEyes:
+        """From what the network says of each frame; None where the frame shows no face."""
+        seen = cls(np.full((len(frames), 2, 5, 2), np.nan), np.full((len(frames), 2, 16, 2), np.nan))
+        for f, eyes in enumerate(frames):
+            for side, eye in enumerate(eyes or (None, None)):
+                if eye is not None:
+                    seen.iris_px[f, side], seen.lids_px[f, side] = eye
+        return seen
+
+    def subset(self, frames: np.ndarray) -> SeenEyes:
+        """Chosen frames [K], indices or bool."""
+        return SeenEyes(self.iris_px[frames], self.lids_px[frames])
 
 
 class IrisNetwork:

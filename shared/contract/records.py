@@ -64,12 +64,19 @@ FRAMES = (
 
 COVARIANCE = Field("covariance", "Covariance of each pose: rotation (radians), then translation (mm).", "float64",
                    "F, 6, 6")
+GAZE = (
+    Field("gaze", "Where the right and the left eye look: yaw towards +x and pitch towards +y in head space, 0 "
+          "straight ahead; NaN while shut or not seen. Absent with `eyes=false`.", "float64", "F, 2, 2", "radians",
+          optional=True),
+    Field("gaze_sigma", "Its standard deviation.", "float64", "F, 2, 2", "radians", optional=True),
+)
 TRACKED_POSES = (
     POSES,
     COVARIANCE,
     FRAME_INDEX,
     SOURCE_LENS,
     CROP_LENS,
+    *GAZE,
 )
 MESH = (
     Field("vertices", "Positions in head space.", "float64", "V, 3", "mm"),
@@ -84,6 +91,13 @@ LANDMARKS = (
           "px"),
     Field("presence", "The network's confidence that a face is there, 0 to 1.", "float64", "F"),
     FRAME_INDEX,
+    Field("iris_px", "Irises of the right and the left eye in the crop: centre, then the rim towards the inner corner, "
+          "above, towards the outer corner and below; NaN where not seen. Absent with `eyes=false`.", "float64",
+          "F, 2, 5, 2", "px", optional=True),
+    Field("lids_px", "Margins of their lids: 0 to 8 the lower one from the outer to the inner corner, 9 to 15 the "
+          "upper one between them.", "float64", "F, 2, 16, 2", "px", optional=True),
+    Field("eye_openness", "Distance between the lids over that of the clip's open eyes.", "float64", "F, 2",
+          optional=True),
 )
 TRACKS = (
     Field("points_head", "Tracked points of the skin in head space.", "float64", "N, 3", "mm"),
@@ -117,6 +131,27 @@ TRACKING = (
     Field("scale", "What fixes the overall size.", "text"),
     Field("identity", "The head model's identity coefficients.", shape="N"),
     Field("expression", "Its expression coefficients.", shape="M"),
+    Field("eyes", "What the frames show of the eyes, the right one first; absent with `eyes=false`.", "",
+          optional=True),
+    Field("eyes.blinks", "Frames in which the lids of both eyes are more than half closed.", "int", "N"),
+    Field("eyes.shut", "The same of each eye: two lists.", "int", "2, N"),
+    Field("eyes.open_mm", "Distance between the lids of open eyes; null where an eye is not seen.", "number or null",
+          "2", "mm"),
+    Field("eyes.gaze", "What the gaze rests on: `camera`, `head` (a place that turns with it) or `wandering`. This and "
+          "all that follows are absent where too few frames show open eyes.", "text", optional=True),
+    Field("eyes.gaze_deviation_deg", "Median standard deviation of the gaze.", unit="deg", optional=True),
+    Field("eyes.gaze_deviation_of_frame_deg", "What of it is each frame's own; the rest all frames share.", unit="deg",
+          optional=True),
+    Field("eyes.centres_mm", "Centres about which the eyes turn, in head space.", shape="2, 3", unit="mm",
+          optional=True),
+    Field("eyes.centres_deviation_mm", "Their standard deviations.", shape="2, 3", unit="mm", optional=True),
+    Field("eyes.iris_distance_mm", "From there to the iris' plane.", unit="mm", optional=True),
+    Field("eyes.iris_radius_mm", "Radius of the irises under the head's scale.", unit="mm", optional=True),
+    Field("eyes.iris_radius_deviation_mm", "Its standard deviation.", unit="mm", optional=True),
+    Field("eyes.iris_error_px", "Distances between an iris' centre as seen and as gaze and pose show it.", "",
+          optional=True),
+    Field("eyes.iris_error_px.median", "Their median.", unit="px", optional=True),
+    Field("eyes.iris_error_px.p95", "What 95 % of them stay below.", unit="px", optional=True),
     Field("excluded", "One entry for each frame without a pose.", ""),
     Field("excluded[].frame_index", "Its number in the source, from 0.", "int"),
     Field("excluded[].reason", "Why it was left out.", "text"),

@@ -31,6 +31,7 @@ REFERENCES = {
     "Duff2017":
         "Duff et al., Building an Orthonormal Basis, Revisited. Journal of Computer Graphics Techniques 6, 2017.",
     "Dupuy2023": "Dupuy, Benyoub, Sampling Visible GGX Normals with Spherical Caps. Computer Graphics Forum 42, 2023.",
+    "Fry1962": "Fry, Hill, The Center of Rotation of the Eye. American Journal of Optometry 39, 1962.",
     "Geman1985":
         "Geman, McClure, Bayesian Image Analysis: An Application to Single Photon Emission Tomography. American "
         "Statistical Association, 1985.",

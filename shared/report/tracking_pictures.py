@@ -6,9 +6,11 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from shared.geometry.eyeballs import SIDES
 from shared.geometry.mesh import Mesh, mesh_edges, rasterize_uv, vertex_normals
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import WORLD_FROM_CAMERA, project, vector_from_rotation
+from shared.tracking.gaze import Gaze
 from shared.tracking.tracks import visible_vertices
 
 MESH_COLOUR, LANDMARK_COLOUR = (70, 220, 255), (255, 150, 40)
@@ -58,8 +60,11 @@ def _fixed(points: np.ndarray) -> np.ndarray:
     return np.rint(np.clip((points - 0.5) * 16.0, -1e6, 1e6)).astype(np.int32)
 
 
-def pose_curves(camera_from_head: np.ndarray, covariance: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-    """Rotation and position over time with bands of two standard deviations -> uint8 [h, w, 3].
+def pose_curves(
+    camera_from_head: np.ndarray, covariance: np.ndarray, time_s: np.ndarray, gaze: Gaze | None = None
+) -> np.ndarray:
+    """Rotation and position over time with bands of two standard deviations, and the gaze of both eyes where given ->
+    uint8 [h, w, 3].
 
     camera_from_head [F, 4, 4]; covariance [F, 6, 6] of rotation vector and translation; time_s [F].
     """
@@ -71,13 +76,18 @@ def pose_curves(camera_from_head: np.ndarray, covariance: np.ndarray, time_s: np
     rotation = _plot(time_s, angles, np.degrees(deviation[:, :3]), ("pitch", "yaw", "roll"), "degrees")
     doubt = _plot(time_s, np.degrees(deviation[:, :3]), None, ("pitch", "yaw", "roll"), "deviation, degrees")
     position = _plot(time_s, shift, deviation[:, 3:], ("across", "down", "depth"), "mm")
-    return np.concatenate([rotation, doubt, position])
+    panels = [rotation, doubt, position]
+    if gaze is not None:
+        for axis, name in enumerate(("yaw", "pitch")):
+            values, own = (np.degrees(kind[:, :, axis]) for kind in (gaze.gaze, gaze.own_sigma))
+            panels.append(_plot(time_s, values, own, tuple(f"{side} {name}" for side in SIDES), "gaze, degrees"))
+    return np.concatenate(panels)
 
 
 def _plot(time_s, values, deviation, names, unit) -> np.ndarray:
-    """Three curves [F, 3] on one panel; deviation [F, 3] or None."""
+    """Two or three curves [F, K] on one panel, with gaps where they are NaN; deviation [F, K] or None."""
     canvas = np.full((PLOT_HEIGHT, PLOT_WIDTH, 3), PAPER, np.uint8)
-    low, high = float(values.min()), float(values.max())
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
     low, high = (low - 0.05 * (high - low), high + 0.05 * (high - low)) if high > low else (low - 1.0, high + 1.0)
     span_s = max(float(np.ptp(time_s)), 1e-6)
 
@@ -90,14 +100,16 @@ def _plot(time_s, values, deviation, names, unit) -> np.ndarray:
         y = int(at(time_s[0], value)[1])
         cv2.line(canvas, (MARGIN, y), (PLOT_WIDTH - 12, y), GRID, 1)
         cv2.putText(canvas, f"{value:.3g}", (4, y + 4), cv2.FONT_HERSHEY_SIMPLEX, 0.4, INK, 1, cv2.LINE_AA)
-    for k, (name, colour) in enumerate(zip(names, CURVE_COLOURS, strict=True)):
-        if deviation is not None:
-            reach = 2 * deviation[:, k]
-            outline = np.concatenate([at(time_s, values[:, k] + reach), at(time_s, values[:, k] - reach)[::-1]])
-            band = canvas.copy()
-            cv2.fillPoly(band, [outline.astype(np.int32)], colour)
-            canvas = cv2.addWeighted(band, 0.35, canvas, 0.65, 0.0)
-        cv2.polylines(canvas, [at(time_s, values[:, k]).astype(np.int32)], False, colour, 1, cv2.LINE_AA)
+    for k, (name, colour) in enumerate(zip(names, CURVE_COLOURS[: len(names)], strict=True)):
+        for part in np.ma.clump_unmasked(np.ma.masked_invalid(values[:, k])):
+            if deviation is not None:
+                reach = 2 * deviation[part, k]
+                upper, lower = (at(time_s[part], values[part, k] + side * reach) for side in (1, -1))
+                band = canvas.copy()
+                cv2.fillPoly(band, [np.concatenate([upper, lower[::-1]]).astype(np.int32)], colour)
+                canvas = cv2.addWeighted(band, 0.35, canvas, 0.65, 0.0)
+            line = at(time_s[part], values[part, k]).astype(np.int32)
+            cv2.polylines(canvas, [line], False, colour, 1, cv2.LINE_AA)
         cv2.putText(canvas, name, (MARGIN + 90 * k, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
     label = f"{unit} over {span_s:.1f} s"
     cv2.putText(canvas, label, (PLOT_WIDTH - 260, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)

@@ -263,7 +263,7 @@ def test_plan_and_run_see_other_models(case, monkeypatch, capsys):
 def test_stages_declare_the_models_that_they_load():
     """Only stages load models, and each names in its declaration all that its loaders read."""
     loaders = {"load_face_networks": set(models.FACE_NETWORKS), "own_face_networks": set(models.FACE_NETWORKS),
-               "load_head_model": {models.HEAD_MODEL_FILE}}
+               "own_iris_network": {models.IRIS_NETWORK}, "load_head_model": {models.HEAD_MODEL_FILE}}
     from shared.contract.pipeline import load_pipeline
 
     seen = set()
@@ -280,4 +280,4 @@ def test_stages_declare_the_models_that_they_load():
             seen |= needed
         else:
             assert not imported, f"{path} loads models, which no declaration would show"
-    assert seen == {*models.FACE_NETWORKS, models.HEAD_MODEL_FILE}
+    assert seen == {*models.FACE_NETWORKS, models.IRIS_NETWORK, models.HEAD_MODEL_FILE}

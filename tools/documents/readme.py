@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import median
 
 from shared.contract.declare import Field, Output, Stage, parameter_table
-from shared.contract.models import FACE_NETWORKS
+from shared.contract.models import FACE_NETWORKS, IRIS_NETWORK
 from shared.contract.pipeline import Pipeline, load_pipeline
 from shared.contract.records import MANIFEST, PROVENANCE
 from shared.io.arrays import read_json
@@ -122,8 +122,10 @@ def _sources(stage: Stage) -> str:
     read = ["the subject's video"] * stage.reads_source
     read += [f"`{name}`" + " (of every clip)" * (name in stage.joins) for name in stage.inputs]
     read += [f"the subject's own {name}, where `subject.yaml` names them" for name in stage.given]
-    models = [name for name in stage.models if name not in FACE_NETWORKS]
-    read += ["the face networks"] * (len(models) < len(stage.models)) + [f"the model `{name}`" for name in models]
+    networks = {"the face networks": FACE_NETWORKS, "the iris network": (IRIS_NETWORK,)}
+    read += [name for name, files in networks.items() if set(files) <= set(stage.models)]
+    listed = {file for files in networks.values() for file in files}
+    read += [f"the model `{name}`" for name in stage.models if name not in listed]
     return ", ".join(read)
 
 

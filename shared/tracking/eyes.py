@@ -1,0 +1,85 @@
+"""What a clip shows of the eyes: lids and gaze of each frame, and how sure they are, as records say it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.capture.iris import SeenEyes
+from shared.geometry.eyeballs import eyeballs_of
+from shared.geometry.surface import Surface
+from shared.tracking.gaze import Gaze, eye_centres, solve_gaze
+from shared.tracking.lids import Lids, lids_of
+
+
+@dataclass(frozen=True)
+class TrackedEyes:
+    """gaze: None where too few frames show open eyes."""
+
+    seen: SeenEyes
+    lids: Lids
+    gaze: Gaze | None
+
+    @property
+    def pose_arrays(self) -> dict[str, np.ndarray]:
+        """gaze and gaze_sigma [F, 2, 2] radians."""
+        nowhere = np.full((len(self.lids.shut), 2, 2), np.nan)
+        found = self.gaze
+        return {"gaze": nowhere if found is None else found.gaze,
+                "gaze_sigma": nowhere if found is None else found.sigma}
+
+    @property
+    def landmark_arrays(self) -> dict[str, np.ndarray]:
+        """iris_px [F, 2, 5, 2], lids_px [F, 2, 16, 2], eye_openness [F, 2]."""
+        return {"iris_px": self.seen.iris_px, "lids_px": self.seen.lids_px, "eye_openness": self.lids.openness}
+
+    def record(self, frame_index: np.ndarray) -> dict:
+        """For tracking.json; frame_index [F]."""
+        shut = self.lids.shut
+        said = {
+            "shut": [[int(i) for i in frame_index[shut[:, side]]] for side in range(2)],
+            "blinks": [int(i) for i in frame_index[shut.all(1)]],
+            "open_mm": _rounded(self.lids.open_mm, 3),
+        }
+        if self.gaze is not None:
+            said |= _gaze_record(self.gaze)
+        return said
+
+
+def _gaze_record(found: Gaze) -> dict:
+    own_deg = np.degrees(np.nanmedian(found.own_sigma))
+    return {
+        "gaze": found.kind,
+        "gaze_deviation_deg": round(float(np.degrees(np.nanmedian(found.sigma))), 3),
+        "gaze_deviation_of_frame_deg": round(float(own_deg), 3),
+        "centres_mm": [_rounded(centre, 3) for centre in found.centres],
+        "centres_deviation_mm": [_rounded(deviation, 3) for deviation in found.centre_sigma],
+        "iris_distance_mm": round(found.iris_distance_mm, 3),
+        "iris_radius_mm": round(found.iris_radius_mm, 4),
+        "iris_radius_deviation_mm": round(found.iris_radius_sigma_mm, 4),
+        "iris_error_px": {
+            "median": round(float(np.nanmedian(found.error_px)), 4),
+            "p95": round(float(np.nanpercentile(found.error_px, 95)), 4),
+        },
+    }
+
+
+def _rounded(values: np.ndarray, digits: int) -> list[float | None]:
+    return [round(float(value), digits) if np.isfinite(value) else None for value in values]
+
+
+def track_eyes(
+    surface: Surface, seen: SeenEyes, camera_from_head: np.ndarray, intrinsics: np.ndarray, time_s: np.ndarray
+) -> TrackedEyes | None:
+    """Lids and gaze of the F frames in which the head has a pose; None where the mesh has no eyeballs.
+
+    camera_from_head [F, 4, 4] mm; intrinsics [3, 3]; time_s [F].
+    """
+    eyeballs = eyeballs_of(surface)
+    if eyeballs is None:
+        return None
+    centres = eye_centres(eyeballs, surface.mesh.vertices)
+    lids = lids_of(seen.lids_px, centres, camera_from_head, intrinsics)
+    gaze = solve_gaze(seen.iris_px, ~lids.shut, centres, camera_from_head, intrinsics, time_s)
+    return TrackedEyes(seen, lids, gaze)

@@ -1,0 +1,92 @@
+"""How far the lids are open in each frame, and the frames in which they are shut.
+
+The lids' margins come from the iris network, which follows a blink; the face mesh's landmarks hardly do. What stays
+when the head's pose is taken out is compared with the clip's own open eyes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.compute.robust import ROBUST_SCALE
+from shared.geometry.transforms import projection_slope
+from shared.tracking.expression import turn_basis
+
+SHUT_READS = 0.1, 0.35
+"""Of the clip's open aperture: what the network still reports of shut lids, the more the darker the lashes are. Where a
+clip has a blink, its own lowest value between these is it; half closed is midway from there to open."""
+LEAST_OPEN = 0.12
+"""Of the eye's width: what is no farther open in most frames is shut throughout. Eyes that squint have 0.18."""
+OTHER_EYE = 1.0 / 3.0
+"""Lids move together: share that the other eye has in what is said of one."""
+UPPER, LOWER, CORNERS = slice(10, 15), slice(2, 7), (0, 8)
+"""Of the lids' sixteen points: the middle of both margins, and the outer and inner corner."""
+ROUNDS, NOT_OPEN, BIAS_PRIOR = 8, 0.8, 0.05
+
+
+@dataclass(frozen=True)
+class Lids:
+    """openness [F, 2]: aperture over that of open eyes, NaN where the eye is not seen; shut [F, 2] bool: lids more than
+    half closed; open_mm [2]: apertures of open eyes. Right, then left eye."""
+
+    openness: np.ndarray
+    shut: np.ndarray
+    open_mm: np.ndarray
+
+
+def lids_of(lids_px: np.ndarray, centres: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray) -> Lids:
+    """lids_px [F, 2, 16, 2] px (shared.capture.iris), NaN where an eye is not seen; centres [2, 3] mm of the eyeballs;
+    camera_from_head [F, 4, 4]; intrinsics [3, 3]."""
+    apertures, widths = lid_apertures(lids_px, centres, camera_from_head, intrinsics)
+    basis = turn_basis(camera_from_head)
+    openness, open_mm, always_shut = np.full(apertures.shape, np.nan), np.full(2, np.nan), np.zeros(2, bool)
+    for eye in range(2):
+        seen = np.isfinite(apertures[:, eye])
+        if seen.any():
+            level, open_mm[eye] = _of_open_eyes(apertures[seen, eye], basis[seen])
+            openness[seen, eye] = apertures[seen, eye] / level
+            always_shut[eye] = open_mm[eye] < LEAST_OPEN * np.median(widths[seen, eye])
+    other = np.where(np.isfinite(openness[:, ::-1]), openness[:, ::-1], openness)
+    together = (1.0 - OTHER_EYE) * openness + OTHER_EYE * other
+    return Lids(openness, (together < half_closed(together)) | (always_shut & np.isfinite(openness)), open_mm)
+
+
+def half_closed(openness: np.ndarray) -> float:
+    """What the openness [F, 2] of lids is, some of them NaN, when they are half closed."""
+    lowest = float(np.nanmin(openness)) if np.isfinite(openness).any() else 1.0
+    reads = SHUT_READS[0] if lowest > SHUT_READS[1] else max(lowest, SHUT_READS[0])
+    return 0.5 * (1.0 + reads)
+
+
+def lid_apertures(
+    lids_px: np.ndarray, centres: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Between the margins' middles along the head's y, and between the corners, each [F, 2] mm at the eyeballs' depth.
+    Arguments as in lids_of."""
+    slopes = np.stack([projection_slope(centres, pose, intrinsics) for pose in camera_from_head])
+    down, across = slopes[..., 1], slopes[..., 0]
+    between = lids_px[:, :, UPPER].mean(2) - lids_px[:, :, LOWER].mean(2)
+    corners = lids_px[:, :, CORNERS[1]] - lids_px[:, :, CORNERS[0]]
+    return _along(between, down), np.abs(_along(corners, across))
+
+
+def _along(vectors: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Vectors [..., 2] px in units of a slope [..., 2] px/mm."""
+    return (vectors * slope).sum(-1) / np.square(slope).sum(-1)
+
+
+def _of_open_eyes(apertures: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, float]:
+    """What apertures [F] mm of open eyes are in each pose, [F], and in the middle; basis [F, B]: see turn_basis. Frames
+    with lids on their way down count little, shut ones not at all."""
+    ridge = BIAS_PRIOR * len(apertures) * np.eye(basis.shape[1])
+    ridge[0, 0] = 0.0
+    level = np.full(len(apertures), np.percentile(apertures, 70.0))
+    for _ in range(ROUNDS):
+        spread = max(ROBUST_SCALE * float(np.median(np.abs(apertures - level))), 0.02 * float(np.median(level)))
+        below = np.clip((NOT_OPEN * level - apertures) / spread, 0.0, None)
+        weight = (1.0 / (1.0 + below**2))[:, None]
+        fit = np.linalg.solve(basis.T @ (weight * basis) + ridge, basis.T @ (weight[:, 0] * apertures))
+        level = np.maximum(basis @ fit, 0.5 * max(fit[0], 1e-6))
+    return level, float(fit[0])

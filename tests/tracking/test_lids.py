@@ -1,0 +1,86 @@
+"""How far lids are open, and when they are shut, on lids drawn in head space."""
+
+import numpy as np
+import pytest
+
+from shared.geometry.transforms import WORLD_FROM_CAMERA, project, rigid, rotation_from_vector
+from shared.tracking.lids import half_closed, lid_apertures, lids_of
+
+FRAMES = 80
+INTRINSICS = np.array([[1700.0, 0.0, 320.0], [0.0, 1700.0, 320.0], [0.0, 0.0, 1.0]])
+CENTRES = np.array([[-31.0, 32.0, 71.0], [31.0, 32.0, 71.0]])
+WIDTH_MM, OPEN_MM, SHUT_MM = 28.0, 9.0, 1.5
+
+
+def poses_of(degrees: float) -> np.ndarray:
+    phase = np.linspace(0.0, 2.0 * np.pi, FRAMES)
+    turn = np.stack([0.4 * np.sin(2 * phase), np.sin(phase), 0 * phase], axis=-1) * np.radians(degrees)
+    rotation = WORLD_FROM_CAMERA.T @ rotation_from_vector(turn)
+    return rigid(rotation, np.broadcast_to([0.0, 20.0, 900.0], (FRAMES, 3)))
+
+
+def drawn(apertures_mm: np.ndarray, poses: np.ndarray, noise_px: float = 0.2) -> np.ndarray:
+    """Lids [F, 2, 16, 2] px, open by apertures [F, 2] mm."""
+    lids = np.zeros((FRAMES, 2, 16, 2))
+    along = np.concatenate([np.linspace(0, 1, 9), np.linspace(0, 1, 9)[1:-1]])
+    above = np.repeat([-0.4, 0.6], [9, 7]) * np.where((along == 0) | (along == 1), 0.0, 1.0)
+    for eye, outward in ((0, -1.0), (1, 1.0)):
+        for f, pose in enumerate(poses):
+            x = outward * WIDTH_MM * (0.5 - along)
+            points = CENTRES[eye] + np.stack([x, apertures_mm[f, eye] * above, 0 * x], axis=-1)
+            lids[f, eye] = project(points, pose, INTRINSICS)[0]
+    return lids + noise_px * np.random.default_rng(5).standard_normal(lids.shape)
+
+
+def blinking() -> np.ndarray:
+    """[F, 2] mm: open, but for three blinks of three frames each and a wink of the right eye."""
+    openings = np.full((FRAMES, 2), OPEN_MM)
+    for start in (12, 38, 60):
+        openings[start : start + 3] = SHUT_MM
+    openings[25:28, 0] = SHUT_MM
+    return openings
+
+
+@pytest.mark.parametrize("degrees", [4.0, 30.0])
+def test_apertures_and_widths_are_those_of_the_eye_under_any_pose(degrees):
+    poses = poses_of(degrees)
+    apertures, widths = lid_apertures(drawn(np.full((FRAMES, 2), OPEN_MM), poses, 0.0), CENTRES, poses, INTRINSICS)
+    assert np.allclose(apertures, OPEN_MM, rtol=0.03) and np.allclose(widths, WIDTH_MM, rtol=0.06)
+
+
+def test_blinks_and_winks_are_found_and_nothing_else():
+    poses, openings = poses_of(25.0), blinking()
+    found = lids_of(drawn(openings, poses), CENTRES, poses, INTRINSICS)
+    assert np.array_equal(found.shut, openings < 0.5 * OPEN_MM)
+    assert np.allclose(found.open_mm, OPEN_MM, rtol=0.05)
+    assert np.allclose(found.openness[openings == OPEN_MM], 1.0, atol=0.15)
+
+
+def test_lids_that_follow_the_pose_are_not_shut():
+    """Who looks at the camera while nodding down raises the lids: that is no blink."""
+    poses = poses_of(25.0)
+    openings = OPEN_MM * (1.0 - 0.35 * np.sin(np.linspace(0, 2 * np.pi, FRAMES)))[:, None] * np.ones(2)
+    assert not lids_of(drawn(openings, poses), CENTRES, poses, INTRINSICS).shut.any()
+
+
+def test_eyes_that_stay_shut_are_shut_and_squinting_ones_are_not():
+    poses = poses_of(25.0)
+    shut, squinting = (
+        lids_of(drawn(np.full((FRAMES, 2), opening), poses), CENTRES, poses, INTRINSICS).shut for opening in (1.8, 5.2)
+    )
+    assert shut.all() and not squinting.any()
+
+
+def test_an_eye_that_is_not_seen_is_neither_open_nor_shut():
+    poses, lids = poses_of(25.0), None
+    lids = drawn(blinking(), poses)
+    lids[:, 1] = np.nan
+    lids[5:9, 0] = np.nan
+    found = lids_of(lids, CENTRES, poses, INTRINSICS)
+    assert np.isnan(found.openness[:, 1]).all() and not found.shut[:, 1].any() and np.isnan(found.open_mm[1])
+    assert np.isnan(found.openness[5:9, 0]).all() and found.shut[12:15, 0].all()
+
+
+def test_half_closed_is_midway_from_what_shut_lids_read():
+    assert half_closed(np.array([[1.0, 0.2], [np.nan, 0.9]])) == pytest.approx(0.6)
+    assert half_closed(np.array([[1.0, 0.6]])) == half_closed(np.array([[1.0, -0.1]])) == pytest.approx(0.55)
