@@ -89,7 +89,7 @@ class IrisNetwork:
 def crop_of_eye(corners: np.ndarray, left: bool = False) -> np.ndarray | None:
     """Affine map [2, 3] from the 64 px crop to the picture, px: the crop's +x runs from the outer to the inner corner
     [2, 2], as it does in a right eye, its +y down the face: a left eye is mirrored. None where the corners are hardly
-    apart."""
+    apart. corners [2, 2] px: outer, then inner; left: of the subject."""
     inward = corners[1] - corners[0]
     width = float(np.hypot(*inward))
     if not width >= LEAST_WIDTH_PX:

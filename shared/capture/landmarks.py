@@ -181,7 +181,8 @@ class FaceNetworks:
 
 
 def warped(rgb: np.ndarray, image_from_crop: np.ndarray, size: int) -> np.ndarray:
-    """float32 [size, size, 3] in [0, 1]: the picture (uint8) under an affine map [2, 3] of integer-centred pixels.
+    """float32 [size, size, 3] in [0, 1]: the picture (uint8) under an affine map image_from_crop [2, 3] of
+    integer-centred pixels.
 
     In floating point: 8-bit results round the other way on other processors, which moves landmarks by 0.01 px.
     """
@@ -209,7 +210,7 @@ def load_network(path: Path) -> cv2.dnn.Net:
 
 
 def run_network(net: cv2.dnn.Net, image: np.ndarray, sizes: tuple[int, ...]) -> list[np.ndarray]:
-    """Run a network on a float32 [H, W, 3] image; outputs, flattened, in the order of the element counts
+    """Run a network on an image float32 [H, W, 3]; outputs, flattened, in the order of the element counts
     `sizes`.
     """
     net.setInput(np.ascontiguousarray(image.transpose(2, 0, 1)[None]))

@@ -128,8 +128,8 @@ def iris_radius(
 ) -> tuple[float, float]:
     """Radius of the irises in mm and its deviation, from their rims beside the centre, which no lid hides.
 
-    Arguments as in solve_gaze; gaze [F, 2, 2]. A disc whose unit normal has the part n along a line of the picture is
-    seen sqrt(1 - n^2) of its diameter wide along it.
+    iris_px [F, 2, 5, 2] px, counts [F, 2] bool, centres [2, 3] mm and the rest as in solve_gaze; gaze [F, 2, 2]. A disc
+    whose unit normal has the part n along a line of the picture is seen sqrt(1 - n^2) of its diameter wide along it.
     """
     depth = project(centres, camera_from_head, intrinsics)[1]
     across = iris_px[:, :, 1] - iris_px[:, :, 3]

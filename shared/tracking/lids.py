@@ -17,8 +17,9 @@ from shared.tracking.expression import turn_basis
 SHUT_READS = 0.1, 0.35
 """Of the clip's open aperture: what the network still reports of shut lids, the more the darker the lashes are. Where a
 clip has a blink, its own lowest value between these is it; half closed is midway from there to open."""
-LEAST_OPEN = 0.12
-"""Of the eye's width: what is no farther open in most frames is shut throughout. Eyes that squint have 0.18."""
+LEAST_OPEN = 0.165
+"""Of the eye's width: what is no farther open in most frames is shut throughout. Eyes that squint have 0.21, of shut
+ones the network reports up to 0.16 in hard light."""
 OTHER_EYE = 1.0 / 3.0
 """Lids move together: share that the other eye has in what is said of one."""
 UPPER, LOWER, CORNERS = slice(10, 15), slice(2, 7), (0, 8)
@@ -41,16 +42,21 @@ def lids_of(lids_px: np.ndarray, centres: np.ndarray, camera_from_head: np.ndarr
     camera_from_head [F, 4, 4]; intrinsics [3, 3]."""
     apertures, widths = lid_apertures(lids_px, centres, camera_from_head, intrinsics)
     basis = turn_basis(camera_from_head)
-    openness, open_mm, always_shut = np.full(apertures.shape, np.nan), np.full(2, np.nan), np.zeros(2, bool)
+    openness, open_mm, opening = np.full(apertures.shape, np.nan), np.full(2, np.nan), np.full((1, 2), np.nan)
     for eye in range(2):
         seen = np.isfinite(apertures[:, eye])
         if seen.any():
             level, open_mm[eye] = _of_open_eyes(apertures[seen, eye], basis[seen])
             openness[seen, eye] = apertures[seen, eye] / level
-            always_shut[eye] = open_mm[eye] < LEAST_OPEN * np.median(widths[seen, eye])
-    other = np.where(np.isfinite(openness[:, ::-1]), openness[:, ::-1], openness)
-    together = (1.0 - OTHER_EYE) * openness + OTHER_EYE * other
+            opening[0, eye] = open_mm[eye] / np.median(widths[seen, eye])
+    together, always_shut = _together(openness), _together(opening) < LEAST_OPEN
     return Lids(openness, (together < half_closed(together)) | (always_shut & np.isfinite(openness)), open_mm)
+
+
+def _together(values: np.ndarray) -> np.ndarray:
+    """Values [N, 2] of both eyes, each with a share of the other's where that is known."""
+    other = np.where(np.isfinite(values[:, ::-1]), values[:, ::-1], values)
+    return (1.0 - OTHER_EYE) * values + OTHER_EYE * other
 
 
 def half_closed(openness: np.ndarray) -> float:
@@ -64,7 +70,7 @@ def lid_apertures(
     lids_px: np.ndarray, centres: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Between the margins' middles along the head's y, and between the corners, each [F, 2] mm at the eyeballs' depth.
-    Arguments as in lids_of."""
+    lids_px [F, 2, 16, 2] px, centres [2, 3] mm and the rest as in lids_of."""
     slopes = np.stack([projection_slope(centres, pose, intrinsics) for pose in camera_from_head])
     down, across = slopes[..., 1], slopes[..., 0]
     between = lids_px[:, :, UPPER].mean(2) - lids_px[:, :, LOWER].mean(2)
