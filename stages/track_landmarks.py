@@ -5,7 +5,8 @@ Reads    sample_frames: the cropped frames and their intrinsics. The subject's o
 Writes   poses.npz, mesh.npz, landmarks.npz, tracks.npz, tracking.json, overlay.png, curves.png, residuals.png.
 Method   468 landmarks a frame start the poses, dense flow and then tracks against the clip's mean texture, adjusted as
          one rigid body, hold them still; the head model is fitted to the tracks and then bent to them freely. Scale is
-         the head model's prior. Frames of another expression than most are left out.
+         the head model's prior. Frames of another expression than most are left out. Irises and
+         lids of each frame tell gaze and blinks.
 Fails    no landmarks in three frames; skin that cannot be tracked (too small, blurred, or not the same head); a head
          that does not turn (a poster, too).
 """
