@@ -137,12 +137,14 @@ TRACKING = (
     Field("eyes.shut", "The same of each eye: two lists.", "int", "2, N"),
     Field("eyes.open_mm", "Distance between the lids of open eyes; null where an eye is not seen.", "number or null",
           "2", "mm"),
-    Field("eyes.gaze", "What the gaze rests on: `camera`, `head` (a place that turns with it) or `wandering`. This and "
-          "all that follows are absent where too few frames show open eyes.", "text", optional=True),
+    Field("eyes.gaze", "What the gaze rests on: `camera`, `place` (one beside the camera), `head` (one that turns with "
+          "it) or `wandering`. This and all that follows are absent where too few frames show open eyes.", "text",
+          optional=True),
     Field("eyes.gaze_deviation_deg", "Median standard deviation of the gaze.", unit="deg", optional=True),
     Field("eyes.gaze_deviation_of_frame_deg", "What of it is each frame's own; the rest all frames share.", unit="deg",
           optional=True),
-    Field("eyes.centres_mm", "Centres about which the eyes turn, in head space.", shape="2, 3", unit="mm",
+    Field("eyes.centres_mm", "Centres about which the eyes turn, in head space: those of the mesh's eyeballs, "
+          "corrected by the clip.", shape="2, 3", unit="mm",
           optional=True),
     Field("eyes.centres_deviation_mm", "Their standard deviations.", shape="2, 3", unit="mm", optional=True),
     Field("eyes.iris_distance_mm", "From there to the iris' plane.", unit="mm", optional=True),

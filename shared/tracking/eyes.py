@@ -9,7 +9,7 @@ import numpy as np
 from shared.capture.iris import SeenEyes
 from shared.geometry.eyeballs import eyeballs_of
 from shared.geometry.surface import Surface
-from shared.tracking.gaze import Gaze, eye_centres, solve_gaze
+from shared.tracking.gaze import Gaze, iris_distance, solve_gaze
 from shared.tracking.lids import Lids, lids_of
 
 
@@ -79,7 +79,9 @@ def track_eyes(
     eyeballs = eyeballs_of(surface)
     if eyeballs is None:
         return None
-    centres = eye_centres(eyeballs, surface.mesh.vertices)
+    centres = np.stack([ball.centre for ball in eyeballs])
     lids = lids_of(seen.lids_px, centres, camera_from_head, intrinsics)
-    gaze = solve_gaze(seen.iris_px, ~lids.shut, centres, camera_from_head, intrinsics, time_s)
+    gaze = solve_gaze(
+        seen.iris_px, ~lids.shut, centres, iris_distance(eyeballs), camera_from_head, intrinsics, time_s
+    )
     return TrackedEyes(seen, lids, gaze)

@@ -1,9 +1,11 @@
 """Where each eye looks in each frame: from the irises' centres, the poses, and what is known of eyes.
 
-An eye turns about a fixed centre in the head, some 13.5 mm behind the cornea's front [Fry1962], with the iris' plane
-10.3 mm ahead of it. The line from one to the other is the gaze. Gaze, the centres and that distance are solved together
-by Gauss-Newton steps: a centre that is a millimetre off turns all gaze by 5 degrees, and only what the person looks at,
-and that both eyes look at one place, tells the two apart.
+An eye turns about a fixed centre in the head, with the plane of the iris at a fixed distance before it. The line from
+one to the other is the gaze. Both are those of the mesh's eyeballs, corrected by the clip, so that these eyeballs show
+the irises where they were seen when the gaze turns them; eyes of anatomy are smaller (10.3 mm from the centre to the
+iris [Fry1962], not 13 to 14), and turn by more. Gaze, centres and distance are solved together by Gauss-Newton steps: a
+centre that is a millimetre off turns all gaze by 4 degrees, and only what the person looks at, and that both eyes look
+at one place, tells the two apart.
 
 What gaze does between frames is a random walk with heavy tails (Cauchy): it rests and jumps, so that noise is averaged
 where it rests and a jump stays one. It rests on the camera or in the head, whichever the clip supports. The line of
@@ -23,14 +25,15 @@ from shared.compute.robust import ROBUST_SCALE, cauchy_weight
 from shared.geometry.eyeballs import Eyeball, gaze_direction, gaze_towards
 from shared.geometry.transforms import camera_centres, project
 
-CORNEA_MM, IRIS_MM, IRIS_SIGMA_MM = 13.5, 10.3, 0.5
-"""From the centre of rotation to the front of the cornea [Fry1962], and to the iris' plane in adults."""
-CENTRE_SIGMA_MM = np.array([1.2, 1.2, 1.5])
-"""How well a fitted head tells the centres."""
+IRIS_RADIUS_MM = 5.85
+"""Of adults: the plane in which a sphere is cut by so large a rim is that of the iris."""
+CENTRE_SIGMA_MM, DISTANCE_SIGMA_MM = np.array([1.2, 1.2, 1.5]), 0.5
+"""How well a fitted head tells the centres, and the distance of the iris' plane from them."""
 OFFSET_SIGMA, ELSEWHERE_SIGMA = np.radians([2.0, 10.0])
 """Of each eye's axis from what it rests on; of both together where that is a place of its own, not the camera."""
-LOOKS = 10.0
-"""All frames count as so many where they tell what they share: the network's errors, and what is looked at, last."""
+LOOKS = 3.0
+"""All frames count as so many where they tell what they share: what is looked at lasts, and so does the network's
+error, which puts an iris that looks aside up to a quarter too near to the middle of the lids."""
 PAIR_SIGMA, REST_SIGMA, LEAST_STEP = np.radians([1.0, 1.0, 0.3])
 """Of the difference of both eyes about its mean; about what the gaze rests on; of a step between frames of a gaze that
 rests."""
@@ -41,6 +44,8 @@ RESTS_DEG, RESTS_SHARE = 3.0, 0.6
 LEAST_NOISE, LEAST_FRAMES = 0.0125, 8
 """Of an iris' diameter: deviation of its centre at best."""
 STEPS = 16
+SIZES = 10.0
+"""All frames count as so many measurements of an iris' size."""
 IRIS_SYSTEMATIC, IRIS_SYSTEMATIC_PX = 0.03, 0.3
 """The network's error of an iris' radius, common to all frames: a share of it, and in pixels; eyes 12 px wide, half of
 the iris under the lids, gave half a pixel too little."""
@@ -51,10 +56,10 @@ class Gaze:
     """gaze and sigma [F, 2, 2] radians (shared.geometry.eyeballs), NaN where an eye is shut or not seen; own_sigma [F,
     2, 2]: what of the latter is each frame's own.
 
-    kind: "camera", "head" or "wandering": what the gaze rests on. centres [2, 3] mm of rotation in head space and
-    centre_sigma [2, 3]; iris_distance_mm: from there to the iris' plane. iris_radius_mm under the head's scale, and its
-    deviation, that of the network included. error_px [F, 2]: between the iris' centre as seen and as this shows it;
-    noise_px: deviation of the former in each of x and y.
+    kind: what the gaze rests on: "camera", "place" (one beside the camera), "head" (one that turns with it), or else
+    "wandering". centres [2, 3] mm of rotation in head space and centre_sigma [2, 3]; iris_distance_mm: from there to
+    the iris' plane. iris_radius_mm under the head's scale, and its deviation, that of the network included. error_px
+    [F, 2]: between the iris' centre as seen and as this shows it; noise_px: deviation of the former in each of x and y.
     """
 
     gaze: np.ndarray
@@ -70,16 +75,17 @@ class Gaze:
     noise_px: float
 
 
-def eye_centres(eyeballs: Sequence[Eyeball], vertices: np.ndarray) -> np.ndarray:
-    """Centres of rotation [2, 3] mm as the mesh has them: behind the front of each eyeball; vertices [V, 3] mm."""
-    fronts = [vertices[ball.vertices, 2].max() for ball in eyeballs]
-    return np.stack([[*ball.centre[:2], front - CORNEA_MM] for ball, front in zip(eyeballs, fronts, strict=True)])
+def iris_distance(eyeballs: Sequence[Eyeball]) -> float:
+    """From the centres of eyeballs to the planes of their irises, mm."""
+    radius = np.mean([ball.radius for ball in eyeballs])
+    return float(np.sqrt(max(radius**2 - IRIS_RADIUS_MM**2, IRIS_RADIUS_MM**2)))
 
 
 def solve_gaze(
     iris_px: np.ndarray,
     counts: np.ndarray,
     centres: np.ndarray,
+    distance_mm: float,
     camera_from_head: np.ndarray,
     intrinsics: np.ndarray,
     time_s: np.ndarray,
@@ -87,26 +93,27 @@ def solve_gaze(
     """Gaze of both eyes; None where too few frames show them.
 
     iris_px [F, 2, 5, 2] px: centre and rim of the right and left iris (shared.capture.iris); counts [F, 2] bool: eyes
-    that are open and seen; centres [2, 3] mm: see eye_centres; camera_from_head [F, 4, 4]; intrinsics [3, 3]; time_s
-    [F].
+    that are open and seen; centres [2, 3] mm of the eyeballs, and distance_mm of the irises' planes from them,
+    both to begin with; camera_from_head [F, 4, 4]; intrinsics [3, 3]; time_s [F].
     """
     counts = counts & np.isfinite(iris_px[:, :, 0]).all(-1)
     if (counts.sum(0) < LEAST_FRAMES).any():
         return None
     noise_px = _noise_px(iris_px, counts, centres, camera_from_head, intrinsics)
-    clip = _Clip(iris_px[:, :, 0], counts, centres, camera_from_head, intrinsics, time_s, noise_px)
+    clip = _Clip(iris_px[:, :, 0], counts, centres, distance_mm, camera_from_head, intrinsics, time_s, noise_px)
     to_camera = clip.to_camera()
     usual = to_camera.mean(0)
     in_head = np.broadcast_to(0.5 * (usual + usual.mean(0)), to_camera.shape)  # between the camera and far away
     fixations = {
         "camera": _Fixation(clip, to_camera, shared_prior(OFFSET_SIGMA)),
+        "place": _Fixation(clip, to_camera, shared_prior(ELSEWHERE_SIGMA)),
         "head": _Fixation(clip, in_head, shared_prior(ELSEWHERE_SIGMA)),
     }
-    kind = max(fixations, key=lambda name: fixations[name].support)
+    kind = max(fixations, key=lambda name: fixations[name].evidence)
     if fixations[kind].share >= RESTS_SHARE:
         state = _Solution(clip, fixations[kind], rests=True)
     else:
-        kind, calmest = "wandering", min(fixations.values(), key=lambda fixation: fixation.step)
+        kind, calmest = "wandering", min((fixations["place"], fixations["head"]), key=lambda fixation: fixation.step)
         state = _Solution(clip, calmest, rests=False)
     state.solve()
     gaze, (sigma, own_sigma) = state.gaze(), state.sigma()
@@ -143,7 +150,7 @@ def iris_radius(
     pixel_mm = depth / intrinsics[0, 0]
     radii = (0.5 * width_px * pixel_mm / np.sqrt(1.0 - along**2))[seen]
     middle = float(np.median(radii))
-    spread = ROBUST_SCALE * float(np.median(np.abs(radii - middle))) / np.sqrt(min(len(radii), LOOKS))
+    spread = ROBUST_SCALE * float(np.median(np.abs(radii - middle))) / np.sqrt(min(len(radii), SIZES))
     systematic = np.hypot(IRIS_SYSTEMATIC * middle, IRIS_SYSTEMATIC_PX * np.median(pixel_mm[seen]))
     return middle, float(np.hypot(spread, systematic))
 
@@ -173,7 +180,7 @@ def shared_prior(together: float) -> np.ndarray:
     """[11, 11] inverse covariance of the shared unknowns: shifts of both centres (6) and of the iris' distance, mm, and
     offsets of the right and left eye's axis (4), radians; together: deviation of their mean."""
     prior = np.zeros((11, 11))
-    prior[:7, :7] = np.diag(np.concatenate([np.tile(CENTRE_SIGMA_MM, 2), [IRIS_SIGMA_MM]]) ** -2.0)
+    prior[:7, :7] = np.diag(np.concatenate([np.tile(CENTRE_SIGMA_MM, 2), [DISTANCE_SIGMA_MM]]) ** -2.0)
     mean, apart = np.full((2, 2), 0.25), np.array([[0.25, -0.25], [-0.25, 0.25]])
     inverse = 2.0 * mean / together**2 + 2.0 * apart / OFFSET_SIGMA**2
     prior[7:, 7:] = np.kron(inverse, np.eye(2))
@@ -187,6 +194,7 @@ class _Clip:
     iris: np.ndarray
     counts: np.ndarray
     centres: np.ndarray
+    distance: float
     poses: np.ndarray
     intrinsics: np.ndarray
     time_s: np.ndarray
@@ -199,7 +207,7 @@ class _Clip:
     def predict(self, gaze: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, ...]:
         """Residuals [F, 2, 2] px, their slopes by gaze [F, 2, 2, 2], by the eye's centre [F, 2, 2, 3] and by the
         distance of the iris [F, 2, 2]; parameters [7]: shifts of the centres (6) and of the distance, mm."""
-        distance = IRIS_MM + parameters[6]
+        distance = self.distance + parameters[6]
         direction = gaze_direction(gaze)
         places = self.centres + parameters[:6].reshape(2, 3) + distance * direction
         rotation = self.poses[:, None, :3, :3]
@@ -233,8 +241,9 @@ def _shared_rows(by_gaze: np.ndarray, by_centre: np.ndarray, by_distance: np.nda
 
 class _Fixation:
     """The gaze held to a reference [F, 2, 2] in all frames: only the shared unknowns [11] are solved, under a prior
-    [11, 11]. share: of the eyes seen that lie near; support: sum of their robust weights; away [F, 2, 2]: what would
-    explain the rest; step: deviation of its course's steps, less the noise, radians."""
+    [11, 11]. share: of the eyes seen that lie near; evidence: logarithm of this hypothesis', in Laplace's
+    approximation; away [F, 2, 2]: what would explain the rest; step: deviation of its course's steps, less the noise,
+    radians."""
 
     def __init__(self, clip: _Clip, reference: np.ndarray, prior: np.ndarray) -> None:
         self.reference, self.prior, self.parameters = reference, prior, np.zeros(11)
@@ -243,14 +252,16 @@ class _Fixation:
             rows = _shared_rows(*slopes)
             limit_px = np.radians(RESTS_DEG) * np.sqrt(np.abs(np.linalg.det(slopes[0])))
             off = np.linalg.norm(residuals, axis=-1)
-            weight = cauchy_weight(off, limit_px * max(1.0, 2.0 ** (4 - step)), clip.counts / np.square(0.5 * limit_px))
-            weight *= min(1.0, LOOKS / (0.5 * clip.counts.sum()))
+            told = min(1.0, LOOKS / (0.5 * clip.counts.sum())) * clip.counts / np.square(0.5 * limit_px)
+            weight = cauchy_weight(off, limit_px * max(1.0, 2.0 ** (4 - step)), told)
             pull = weight[..., None, None] * rows
             normal = np.einsum("feri,ferj->ij", pull, rows) + prior
             right = np.einsum("feri,fer->i", pull, residuals) - prior @ self.parameters
             self.parameters = self.parameters + np.linalg.solve(normal, right)
         self.share = float((off < limit_px)[clip.counts].mean())
-        self.support = float(cauchy_weight(off, limit_px)[clip.counts].sum())
+        loss = (told * np.square(limit_px) * np.log1p(np.square(off / limit_px))).sum()
+        volume = np.linalg.slogdet(normal)[1] - np.linalg.slogdet(prior)[1]
+        self.evidence = -0.5 * float(loss + self.parameters @ prior @ self.parameters + volume)
         self.away = np.linalg.solve(slopes[0], residuals[..., None])[..., 0]
         noise = np.median((clip.noise_px / limit_px)[clip.counts]) * np.radians(RESTS_DEG)
         self.step = _step_deviation(self.away, clip.counts, noise)
@@ -291,7 +302,7 @@ class _Solution:
     @property
     def distance(self) -> float:
         """Of the iris from the centre, mm."""
-        return float(IRIS_MM + self.parameters[6])
+        return float(self.clip.distance + self.parameters[6])
 
     def residuals(self) -> np.ndarray:
         """[F, 2, 2] px"""

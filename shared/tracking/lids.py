@@ -24,7 +24,10 @@ OTHER_EYE = 1.0 / 3.0
 """Lids move together: share that the other eye has in what is said of one."""
 UPPER, LOWER, CORNERS = slice(10, 15), slice(2, 7), (0, 8)
 """Of the lids' sixteen points: the middle of both margins, and the outer and inner corner."""
-ROUNDS, NOT_OPEN, BIAS_PRIOR = 8, 0.8, 0.05
+ROUNDS, NOT_OPEN = 8, 0.8
+BIAS_PRIOR, LEAST_LEVEL = 0.3, 0.75
+"""Ridge on what of the aperture may follow the pose, a share of the evidence, and the least that it may leave of it: a
+blink while the head nods is none of it."""
 
 
 @dataclass(frozen=True)
@@ -94,5 +97,5 @@ def _of_open_eyes(apertures: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray,
         below = np.clip((NOT_OPEN * level - apertures) / spread, 0.0, None)
         weight = (1.0 / (1.0 + below**2))[:, None]
         fit = np.linalg.solve(basis.T @ (weight * basis) + ridge, basis.T @ (weight[:, 0] * apertures))
-        level = np.maximum(basis @ fit, 0.5 * max(fit[0], 1e-6))
+        level = np.maximum(basis @ fit, LEAST_LEVEL * max(fit[0], 1e-6))
     return level, float(fit[0])

@@ -2,16 +2,15 @@
 
 import numpy as np
 import pytest
-from shapes import sphere
 
 from shared.geometry.eyeballs import Eyeball, gaze_direction, gaze_rotation, gaze_towards
 from shared.geometry.transforms import WORLD_FROM_CAMERA, camera_centres, project, rigid, rotation_from_vector
-from shared.tracking.gaze import IRIS_MM, _direction_slope, eye_centres, iris_radius, solve_gaze
+from shared.tracking.gaze import _direction_slope, iris_distance, iris_radius, solve_gaze
 
 FRAMES, DISTANCE_MM, FOCAL_PX = 90, 900.0, 1700.0
 INTRINSICS = np.array([[FOCAL_PX, 0.0, 320.0], [0.0, FOCAL_PX, 320.0], [0.0, 0.0, 1.0]])
 CENTRES = np.array([[-31.0, 32.0, 71.0], [31.5, 32.5, 70.5]])
-RADIUS_MM = 5.85
+RADIUS_MM, IRIS_MM = 5.85, 13.8
 TIME = np.arange(FRAMES) / 15.0
 
 
@@ -47,7 +46,7 @@ def jumping() -> np.ndarray:
 
 def solved(gaze, poses, noise_px=0.3, centres=CENTRES, counts=None):
     counts = np.ones((FRAMES, 2), bool) if counts is None else counts
-    return solve_gaze(seen(gaze, poses, noise_px), counts, centres, poses, INTRINSICS, TIME)
+    return solve_gaze(seen(gaze, poses, noise_px), counts, centres, IRIS_MM, poses, INTRINSICS, TIME)
 
 
 def error_deg(found, gaze: np.ndarray) -> np.ndarray:
@@ -93,8 +92,9 @@ def test_deviations_say_how_far_off_it_is():
     gaze = towards_camera(poses)
     for seed in range(12):
         off = np.random.default_rng(seed).standard_normal((2, 3)) * (1.2, 1.2, 1.5)
-        found = solve_gaze(seen(gaze, poses, 0.3, seed), np.ones((FRAMES, 2), bool), CENTRES + off, poses, INTRINSICS,
-                           TIME)
+        counts = np.ones((FRAMES, 2), bool)
+        iris_px = seen(gaze, poses, 0.3, seed)
+        found = solve_gaze(iris_px, counts, CENTRES + off, IRIS_MM, poses, INTRINSICS, TIME)
         ratio.append(((found.gaze - gaze) / found.sigma)[::15])
     assert 0.3 < np.sqrt(np.mean(np.square(ratio))) < 1.3
 
@@ -107,7 +107,7 @@ def test_a_shut_eye_has_no_gaze_and_pulls_nothing():
     iris = seen(gaze, poses, 0.2)
     blinked = iris.copy()
     blinked[30:36] += (0.0, 40.0)
-    found, other = (solve_gaze(points, counts, CENTRES, poses, INTRINSICS, TIME) for points in (iris, blinked))
+    found, other = (solve_gaze(points, counts, CENTRES, IRIS_MM, poses, INTRINSICS, TIME) for points in (iris, blinked))
     assert np.isnan(found.gaze[30:36]).all() and np.isnan(found.sigma[30:36]).all()
     assert np.isfinite(found.gaze[counts]).all()
     assert np.array_equal(found.gaze, other.gaze, equal_nan=True)
@@ -118,7 +118,7 @@ def test_an_iris_whose_rim_disagrees_says_less():
     gaze = towards_camera(poses)
     iris = seen(gaze, poses, 0.2)
     iris[40, 0, [1, 3]] += (0.0, 6.0)
-    found = solve_gaze(iris, np.ones((FRAMES, 2), bool), CENTRES, poses, INTRINSICS, TIME)
+    found = solve_gaze(iris, np.ones((FRAMES, 2), bool), CENTRES, IRIS_MM, poses, INTRINSICS, TIME)
     assert found.sigma[40, 0, 1] > found.sigma[38, 0, 1]
 
 
@@ -136,7 +136,6 @@ def test_too_few_eyes_are_none():
     assert solved(towards_camera(poses), poses, counts=counts) is None
 
 
-def test_the_centre_lies_behind_the_front_of_the_eyeball():
-    ball = sphere(15.0, 3).vertices + (30.0, 32.0, 69.0)
-    eyeball = Eyeball(np.arange(len(ball)), np.zeros(0, int), ball.mean(0), 15.0)
-    assert np.allclose(eye_centres([eyeball, eyeball], ball), [30.0, 32.0, 84.0 - 13.5], atol=0.05)
+def test_the_iris_lies_where_its_rim_cuts_the_eyeball():
+    eyeball = Eyeball(np.zeros(0, int), np.zeros(0, int), np.zeros(3), 15.0)
+    assert np.hypot(iris_distance([eyeball, eyeball]), RADIUS_MM) == pytest.approx(15.0)
