@@ -133,8 +133,9 @@ TRACKING = (
     Field("expression", "Its expression coefficients.", shape="M"),
     Field("eyes", "What the frames show of the eyes, the right one first; absent with `eyes=false`.", "",
           optional=True),
-    Field("eyes.blinks", "Frames in which the lids of both eyes are more than half closed.", "int", "N"),
-    Field("eyes.shut", "The same of each eye: two lists.", "int", "2, N"),
+    Field("eyes.blinks", "Frames in which the lids of both eyes are more than half closed.", "int", "B"),
+    Field("eyes.shut_right", "The same of the right eye.", "int", "R"),
+    Field("eyes.shut_left", "The same of the left eye.", "int", "L"),
     Field("eyes.open_mm", "Distance between the lids of open eyes; null where an eye is not seen.", "number or null",
           "2", "mm"),
     Field("eyes.gaze", "What the gaze rests on: `camera`, `place` (one beside the camera), `head` (one that turns with "

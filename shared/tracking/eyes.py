@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shared.capture.iris import SeenEyes
-from shared.geometry.eyeballs import eyeballs_of
+from shared.geometry.eyeballs import SIDES, eyeballs_of
 from shared.geometry.surface import Surface
 from shared.tracking.gaze import Gaze, iris_distance, solve_gaze
 from shared.tracking.lids import Lids, lids_of
@@ -38,8 +38,8 @@ class TrackedEyes:
         """For tracking.json; frame_index [F]."""
         shut = self.lids.shut
         said = {
-            "shut": [[int(i) for i in frame_index[shut[:, side]]] for side in range(2)],
             "blinks": [int(i) for i in frame_index[shut.all(1)]],
+            **{f"shut_{name}": [int(i) for i in frame_index[shut[:, side]]] for side, name in enumerate(SIDES)},
             "open_mm": _rounded(self.lids.open_mm, 3),
         }
         if self.gaze is not None:

@@ -44,8 +44,8 @@ RESTS_DEG, RESTS_SHARE = 3.0, 0.6
 LEAST_NOISE, LEAST_FRAMES = 0.0125, 8
 """Of an iris' diameter: deviation of its centre at best."""
 STEPS = 16
-SIZES = 10.0
-"""All frames count as so many measurements of an iris' size."""
+LEAST_FACING, SIZES = 0.8, 10.0
+"""Irises that look narrower than such a share are not measured; all others count as so many measurements."""
 IRIS_SYSTEMATIC, IRIS_SYSTEMATIC_PX = 0.03, 0.3
 """The network's error of an iris' radius, common to all frames: a share of it, and in pixels; eyes 12 px wide, half of
 the iris under the lids, gave half a pixel too little."""
@@ -119,7 +119,9 @@ def solve_gaze(
     gaze, (sigma, own_sigma) = state.gaze(), state.sigma()
     for values in (gaze, sigma, own_sigma):
         values[~counts] = np.nan
-    radius, radius_sigma = iris_radius(iris_px, counts, gaze, state.centres, camera_from_head, intrinsics)
+    radius, radius_sigma = iris_radius(
+        iris_px, counts, gaze, state.centres, state.distance, camera_from_head, intrinsics
+    )
     error = np.where(counts, np.linalg.norm(state.residuals(), axis=-1), np.nan)
     centre_sigma = np.sqrt(state.shared_covariance().diagonal()[:6]).reshape(2, 3)
     return Gaze(gaze, sigma, own_sigma, kind, state.centres, centre_sigma, state.distance, radius, radius_sigma, error,
@@ -131,24 +133,30 @@ def iris_radius(
     counts: np.ndarray,
     gaze: np.ndarray,
     centres: np.ndarray,
+    distance_mm: float,
     camera_from_head: np.ndarray,
     intrinsics: np.ndarray,
 ) -> tuple[float, float]:
     """Radius of the irises in mm and its deviation, from their rims beside the centre, which no lid hides.
 
-    iris_px [F, 2, 5, 2] px, counts [F, 2] bool, centres [2, 3] mm and the rest as in solve_gaze; gaze [F, 2, 2]. A disc
-    whose unit normal has the part n along a line of the picture is seen sqrt(1 - n^2) of its diameter wide along it.
+    iris_px [F, 2, 5, 2] px, counts [F, 2] bool, centres [2, 3] mm, distance_mm and the rest as in solve_gaze; gaze [F,
+    2, 2]. Of a disc of radius 1 with the unit normal n, at depth z on the line of sight (x, y, 1), the extent along
+    a line a of the picture is f / z times the length of what w = (a, -a (x, y)) has across n.
     """
-    depth = project(centres, camera_from_head, intrinsics)[1]
     across = iris_px[:, :, 1] - iris_px[:, :, 3]
     width_px = np.linalg.norm(across, axis=-1)
-    facing = np.einsum("fij,fkj->fki", camera_from_head[:, :3, :3], gaze_direction(gaze))
-    along = (facing[..., :2] * across).sum(-1) / np.maximum(width_px, 1e-9)
-    seen = counts & (np.abs(along) < 0.6)
+    line = across / np.maximum(width_px, 1e-9)[..., None]
+    normal = np.einsum("fij,fkj->fki", camera_from_head[:, :3, :3], gaze_direction(gaze))
+    pixels, depth = project(centres, camera_from_head, intrinsics)
+    depth = depth + distance_mm * normal[..., 2]
+    sight = (pixels - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]]
+    w = np.concatenate([line, -(line * sight).sum(-1, keepdims=True)], axis=-1)
+    share = np.sqrt(np.square(w).sum(-1) - np.square((w * normal).sum(-1)))
+    seen = counts & (share > LEAST_FACING)
     if not seen.any():
         return float("nan"), float("nan")
     pixel_mm = depth / intrinsics[0, 0]
-    radii = (0.5 * width_px * pixel_mm / np.sqrt(1.0 - along**2))[seen]
+    radii = (0.5 * width_px * pixel_mm / share)[seen]
     middle = float(np.median(radii))
     spread = ROBUST_SCALE * float(np.median(np.abs(radii - middle))) / np.sqrt(min(len(radii), SIZES))
     systematic = np.hypot(IRIS_SYSTEMATIC * middle, IRIS_SYSTEMATIC_PX * np.median(pixel_mm[seen]))

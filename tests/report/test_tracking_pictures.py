@@ -1,5 +1,7 @@
 """The tracking stage's pictures show what they are given."""
 
+from types import SimpleNamespace
+
 import numpy as np
 from shapes import grid_plane
 
@@ -50,6 +52,18 @@ def test_curves_of_a_still_head_and_of_one_frame():
     one = pose_curves(turn(1), np.eye(6)[None] * 1e-6, np.zeros(1))
     assert still.shape == one.shape == (3 * PLOT_HEIGHT, PLOT_WIDTH, 3)
     assert (np.abs(still.astype(int) - CURVE_COLOURS[2]).max(-1) < 40).sum() > 100
+
+
+def test_gaze_has_a_panel_for_each_angle_with_gaps_where_an_eye_is_shut():
+    frames = 20
+    angles = np.radians(np.linspace(-20, 20, frames))[:, None, None] * np.ones((frames, 2, 2))
+    angles[8:12] = np.nan
+    gaze = SimpleNamespace(gaze=angles, own_sigma=np.full_like(angles, 1e-4))
+    picture = pose_curves(turn(frames), np.tile(1e-6 * np.eye(6), (frames, 1, 1)), np.arange(frames) / 15.0, gaze)
+    assert picture.shape[0] == 5 * PLOT_HEIGHT
+    drawn = (np.abs(picture[3 * PLOT_HEIGHT + 20 : 4 * PLOT_HEIGHT].astype(int) - CURVE_COLOURS[1]).max(-1) < 40).any(0)
+    middle = (56 + PLOT_WIDTH - 12) // 2
+    assert not drawn[middle - 10 : middle + 10].any() and drawn[100:300].all() and drawn[600:800].all()
 
 
 def at(picture, point):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from shapes import nods
 
 from shared.geometry.eyeballs import Eyeball, gaze_direction, gaze_rotation, gaze_towards
 from shared.geometry.transforms import WORLD_FROM_CAMERA, camera_centres, project, rigid, rotation_from_vector
@@ -123,10 +124,10 @@ def test_an_iris_whose_rim_disagrees_says_less():
 
 
 def test_the_radius_of_the_iris_is_measured_from_any_side():
-    poses = turning(35.0)
-    gaze = np.zeros((FRAMES, 2, 2))
-    radius, sigma = iris_radius(seen(gaze, poses), np.ones((FRAMES, 2), bool), gaze, CENTRES, poses, INTRINSICS)
-    assert radius == pytest.approx(RADIUS_MM, rel=0.02) and 0.02 < sigma / radius < 0.06
+    poses, gaze = nods(35.0 * np.sin(np.linspace(0.0, 2.0 * np.pi, FRAMES))), np.zeros((FRAMES, 2, 2))
+    counts = np.ones((FRAMES, 2), bool)
+    radius, sigma = iris_radius(seen(gaze, poses), counts, gaze, CENTRES, IRIS_MM, poses, INTRINSICS)
+    assert radius == pytest.approx(RADIUS_MM, rel=0.005) and 0.02 < sigma / radius < 0.06
 
 
 def test_too_few_eyes_are_none():
