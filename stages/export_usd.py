@@ -244,6 +244,7 @@ def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     records[STAGE.name] = own
     kept = ("model", "residuals", "lamp", "albedo_scale", "held_out_frames", "clips")
     chosen = {key: solve[key] for key in kept if key in solve}
+    chosen |= head_scale_record(job, solve)
     if selection := selection_record(job.input("inverse_render"), solve):
         chosen["model_selection"] = selection
     return {
@@ -252,6 +253,15 @@ def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
         "warnings": [{"stage": stage, "text": text} for stage, text in warnings],
         **chosen,
     }
+
+
+def head_scale_record(job: Job, solve: dict) -> dict:
+    """What tracking said of the head's size, of the clip whose mesh it is; nothing where that had none to say."""
+    from shared.io.arrays import read_json
+
+    own = next((clip["name"] for clip in solve.get("clips", ()) if clip["mesh"]), "")
+    tracking = read_json(job.input("track_landmarks", own) / "tracking.json")
+    return {"head_scale": tracking["scale"]} if "scale" in tracking else {}
 
 
 def method_records(job: Job, record: dict, solve: dict):

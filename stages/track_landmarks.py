@@ -4,9 +4,9 @@ Reads    sample_frames: the cropped frames and their intrinsics. The subject's o
          subject.yaml names them.
 Writes   poses.npz, mesh.npz, landmarks.npz, tracks.npz, tracking.json, overlay.png, curves.png, residuals.png.
 Method   468 landmarks a frame start the poses, dense flow and then tracks against the clip's mean texture, adjusted as
-         one rigid body, hold them still; the head model is fitted to the tracks and then bent to them freely. Scale is
-         the head model's prior. Frames of another expression than most are left out. Irises and
-         lids of each frame tell gaze and blinks.
+         one rigid body, hold them still; the head model is fitted to the tracks and then bent to them freely. Its size
+         is the head model's mean and what the irises say, or that of a given length. Frames of another expression than
+         most are left out. Irises and lids of each frame tell gaze and blinks.
 Fails    no landmarks in three frames; skin that cannot be tracked (too small, blurred, or not the same head); a head
          that does not turn (a poster, too).
 """
@@ -161,9 +161,9 @@ def excluded_frames(frames, used: np.ndarray, presence: np.ndarray, reasons: lis
     return excluded
 
 
-def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[dict], common, eyes: dict) -> dict:
+def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[dict], common, measured: dict) -> dict:
     """tracking.json; its warnings also go to the log. fits [F] bool: frames that got a pose; common: their
-    expression; eyes: what is said of them."""
+    expression; measured: what is said of scale and eyes."""
     from shared.geometry.transforms import rotation_range_deg
     from shared.tracking.track_quality import rotation_deviation_deg, warnings_of
 
@@ -197,17 +197,39 @@ def summarise(job: Job, frames, model, track, fits: np.ndarray, excluded: list[d
             "log_deviation": round(track.focal_deviation, 5),
         },
         "held": job.subject.hold_poses,
-        "scale": "fixed by the head model's mean size and identity prior",
         "identity": [round(float(code), 4) for code in track.fit.identity],
         "expression": [round(float(code), 4) for code in track.fit.expression],
-        **eyes,
+        **measured,
     }
+
+
+def size_head(job: Job, frames, model, kept: np.ndarray, seen, track, fits: np.ndarray, lens: np.ndarray):
+    """-> the track at the head's own size, its surface, its eyes (None without `eyes`), and what set that size. kept
+    [F] int: positions of the frames with a pose, which fits [U] bool has of the tracked ones; seen: eyes of all frames;
+    lens [3, 3]."""
+    from shared.geometry.mesh import Mesh
+    from shared.geometry.surface import Surface
+    from shared.tracking.eyes import head_scale, track_eyes
+
+    def measured(track):
+        mesh = Mesh(track.fit.vertices, model.faces, model.uvs, model.face_uvs)
+        surface = Surface(mesh, model.face_segment, model.segment_names)
+        if seen is None:
+            return surface, None
+        poses = track.camera_from_head[fits]
+        return surface, track_eyes(surface, seen.subset(kept), poses, lens, frames.time_s[kept])
+
+    surface, eyes = measured(track)
+    scale = head_scale(surface, eyes, job.subject.pupil_distance_mm)
+    job.note(f"size: {100 * (scale.factor - 1):+.1f} % (deviation {100 * scale.log_deviation:.1f} %) by {scale.method}")
+    if scale.factor != 1.0:
+        track = track.scaled(scale.factor)
+        surface, eyes = measured(track)
+    return track, surface, eyes, scale
 
 
 def publish(job: Job, frames, model, used, landmarks_px, presence, seen, track) -> None:
     """Writes all outputs."""
-    from shared.geometry.mesh import Mesh
-    from shared.geometry.surface import Surface
     from shared.imaging.color import eight_bit
     from shared.io.arrays import save_arrays, write_json
     from shared.io.images import write_png
@@ -215,7 +237,6 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, seen, track) 
     from shared.report.tracking_pictures import overlay_strip, pose_curves, residual_map
     from shared.tracking.bundle import zoomed
     from shared.tracking.expression import common_expression
-    from shared.tracking.eyes import track_eyes
     from shared.tracking.first_poses import choose_references
     from shared.tracking.track_quality import frames_that_fit
 
@@ -227,11 +248,9 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, seen, track) 
     )
     fits = fits & common.shown
     reasons = [reason or common.reason(k) for k, reason in enumerate(reasons)]
-    kept, poses, covariance = used[fits], track.camera_from_head[fits], track.covariance[fits]
-    mesh = Mesh(track.fit.vertices, model.faces, model.uvs, model.face_uvs)
-    surface, eyes = Surface(mesh, model.face_segment, model.segment_names), None
-    if seen is not None:
-        eyes = track_eyes(surface, seen.subset(kept), poses, lens, frames.time_s[kept])
+    kept = used[fits]
+    track, surface, eyes, scale = size_head(job, frames, model, kept, seen, track, fits, lens)
+    mesh, poses, covariance = surface.mesh, track.camera_from_head[fits], track.covariance[fits]
     save_arrays(
         job.out / "poses.npz",
         camera_from_head=poses,
@@ -252,7 +271,7 @@ def publish(job: Job, frames, model, used, landmarks_px, presence, seen, track) 
     residual = np.nanmedian(track.error_px[fits], axis=0)
     save_arrays(job.out / "tracks.npz", points_head=track.points_head, residual_px=residual, sigma_mm=track.sigma_mm)
     excluded = excluded_frames(frames, used, presence, reasons)
-    said = {} if eyes is None else {"eyes": eyes.record(frames.frame_index[kept])}
+    said = {"scale": scale.record()} | ({} if eyes is None else {"eyes": eyes.record(frames.frame_index[kept])})
     write_json(job.out / "tracking.json", summarise(job, frames, model, track, fits, excluded, common, said))
     chosen, gaze = choose_references(poses, 5), None if eyes is None else eyes.gaze
     pictures = [eight_bit(frames.read_codes(i)) for i in kept[chosen]]

@@ -106,6 +106,12 @@ TRACKS = (
     Field("sigma_mm", "Standard deviation of each point in depth. Errors that neighbours share are included, so the "
           "points count as independent.", "float64", "N", "mm"),
 )
+_HEAD_SCALE = (
+    Field("scale", "The overall size, and what fixes it.", ""),
+    Field("scale.method", "In words.", "text"),
+    Field("scale.factor", "By how much the head is larger than the head model alone would have it."),
+    Field("scale.log_deviation", "Standard deviation of the logarithm of the size."),
+)
 TRACKING = (
     Field("segments", "Names of the face segments.", "text", "S"),
     Field("frames", "Frames with a pose.", "int"),
@@ -128,7 +134,7 @@ TRACKING = (
     Field("focal.gain", "The focal length that the tracks ask for, relative to the one of `frames.json`."),
     Field("focal.log_deviation", "Standard deviation of the logarithm of that."),
     Field("held", "Whether the poses were given and stay as they are.", "bool"),
-    Field("scale", "What fixes the overall size.", "text"),
+    *_HEAD_SCALE,
     Field("identity", "The head model's identity coefficients.", shape="N"),
     Field("expression", "Its expression coefficients.", shape="M"),
     Field("eyes", "What the frames show of the eyes, the right one first; absent with `eyes=false`.", "",
@@ -358,6 +364,7 @@ RUN = (
     Field("residuals.**", "As in solve.json.", ""),
     *_LAMP,
     *_SCALE,
+    *(replace(field, path=f"head_{field.path}", optional=True) for field in _HEAD_SCALE),
     Field("held_out_frames", "Frames of the (first) clip that were not fitted.", "int", "H"),
     *_CLIPS,
     Field("model_selection", "With model=auto: as in solve.json, and with the seconds of each.", "", optional=True),

@@ -26,8 +26,11 @@ _CAMERA = (
     Parameter("sensor_width_mm", float, None, "Width of the sensor's used part.", "mm", 1.0, 500.0),
     Parameter("focal_length_px", float, None, "Focal length in pixels of the source frame.", "px", 10.0, 1e6),
 )
+_HEAD = (
+    Parameter("pupil_distance_mm", float, None, "Distance of the pupils of eyes that look far away.", "mm", 40.0, 90.0),
+)
 _CLIP_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}\Z")
-_OF_A_CLIP, _OF_ALL = ("video", "camera", "colour", "tracking", "chart"), ("clips", "capture")
+_OF_A_CLIP, _OF_ALL = ("video", "camera", "colour", "tracking", "chart"), ("clips", "capture", "head")
 _NEW = "make a subject with: limn new CLIP"
 
 
@@ -36,8 +39,9 @@ class Subject:
     """Facts of subject.yaml. video: absolute path of the file, or of an image sequence with a counter (%05d).
 
     focal_length_px: of the source frame; None with focal_length_mm also None means: estimate it. landmarks, poses:
-    files of another tracker; hold_poses: whether its poses stay as they are. chart: where a colour chart is. clips: of
-    several clips of one head under different lights each as a subject of its own, named as in subject.yaml; all else is
+    files of another tracker; hold_poses: whether its poses stay as they are. chart: where a colour chart is.
+    pupil_distance_mm: of eyes that look far away, which sets the head's size; None: it is estimated. clips: of several
+    clips of one head under different lights each as a subject of its own, named as in subject.yaml; all else is
     the first one's then.
     """
 
@@ -53,12 +57,15 @@ class Subject:
     poses: Path | None = None
     hold_poses: bool = False
     chart: ChartPlace = AUTO
+    pupil_distance_mm: float | None = None
     clips: tuple[Subject, ...] = ()
 
     def content(self) -> dict[str, object]:
         """All that every stage depends on, independent of where the folder lies."""
         keys = ("focal_length_px", "focal_length_mm", "sensor_width_mm", "transfer", "moves")
         own: dict[str, object] = {key: getattr(self, key) for key in keys}
+        if self.pupil_distance_mm is not None:
+            own["pupil_distance_mm"] = self.pupil_distance_mm
         return own | {"clips": [[clip.name, clip.content()] for clip in self.clips]} if self.clips else own
 
     def clip(self, name: str, where: str) -> Subject:
@@ -144,7 +151,7 @@ def _clips(content: dict, path: Path) -> list[tuple[str, dict]]:
     if not 2 <= len(named) <= MOST_CLIPS:
         raise InputError("number of clips not allowed", where=where, got=len(named), expected=f"2 .. {MOST_CLIPS}",
                          hint="name one clip as video: FILE, without clips")
-    common = {key: content[key] for key in ("camera", "colour") if content.get(key) is not None}
+    common = {key: content[key] for key in ("camera", "colour", "head") if content.get(key) is not None}
     return [(name, common | check_keys(own, _OF_A_CLIP, f"{where}.{name}")) for name, own in named.items()]
 
 
@@ -156,7 +163,9 @@ def _clip(folder: Path, name: str, content: dict, moves: str, where: str) -> Sub
     transfer = _choice(colour.get("transfer", "srgb"), TRANSFERS, f"{where}colour.transfer")
     given = _tracking(folder, content.get("tracking"), f"{where}tracking")
     chart = parse_chart(content.get("chart"), f"{where}chart")
-    subject = Subject(folder, name, video, transfer=transfer, moves=moves, chart=chart, **camera, **given)
+    head = check_keys(content.get("head"), [p.name for p in _HEAD], f"{where}head")
+    head = {p.name: p.parse(head.get(p.name), f"{where}head.{p.name}") for p in _HEAD}
+    subject = Subject(folder, name, video, transfer=transfer, moves=moves, chart=chart, **camera, **given, **head)
     _check_files(subject)
     return subject
 

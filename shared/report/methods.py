@@ -138,8 +138,10 @@ def _tracking(records: RunRecords) -> Iterable[str]:
            "{Kroeger2016} with a forward-backward check {Kalal2010}, then matched against the clip's own mean texture "
            "{Baker2004}, and poses and points were adjusted together {Triggs2000}.")
     yield ("A linear head model {Blanz1999} built from MakeHuman's data (CC0) was fitted to the points {Chen1992} and "
-           "then bent towards them {Botsch2008}; its mean size sets the scale.")
+           "then bent towards them {Botsch2008}.")
     for clip in records.clips:
+        if scale := clip.tracking.get("scale"):
+            yield (f"{_of(clip)}, {scale['method']} set the scale (known to {100 * scale['log_deviation']:.1f} %).")
         error, turn = clip.tracking.get("reprojection_px"), clip.tracking.get("rotation_range_deg")
         if error and turn is not None:
             tracks, frames = clip.tracking.get("tracks"), clip.tracking.get("frames")

@@ -86,6 +86,9 @@ REFERENCES = {
     "Ren2006":
         "Ren et al., Real-time Soft Shadows in Dynamic Scenes using Spherical Harmonic Exponentiation. SIGGRAPH 2006.",
     "Rue2005": "Rue, Held, Gaussian Markov Random Fields: Theory and Applications. Chapman and Hall, 2005.",
+    "Ruefer2005":
+        "Rüfer, Schröder, Erb, White-to-White Corneal Diameter: Normal Values in Healthy Humans Obtained with the "
+        "Orbscan II Topography System. Cornea 24, 2005.",
     "Saad2003": "Saad, Iterative Methods for Sparse Linear Systems, second edition. SIAM, 2003.",
     "Schlick1994":
         "Schlick, An Inexpensive BRDF Model for Physically-based Rendering. Computer Graphics Forum 13, 1994.",

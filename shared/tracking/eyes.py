@@ -9,7 +9,8 @@ import numpy as np
 from shared.capture.iris import SeenEyes
 from shared.geometry.eyeballs import SIDES, eyeballs_of
 from shared.geometry.surface import Surface
-from shared.tracking.gaze import Gaze, iris_distance, solve_gaze
+from shared.tracking.gaze import CENTRE_SIGMA_MM, Gaze, iris_distance, solve_gaze
+from shared.tracking.head_scale import BY_MODEL, HeadScale, scale_by_iris, scale_by_length
 from shared.tracking.lids import Lids, lids_of
 
 
@@ -85,3 +86,17 @@ def track_eyes(
         seen.iris_px, ~lids.shut, centres, iris_distance(eyeballs), camera_from_head, intrinsics, time_s
     )
     return TrackedEyes(seen, lids, gaze)
+
+
+def head_scale(surface: Surface, eyes: TrackedEyes | None, pupil_distance_mm: float | None) -> HeadScale:
+    """The head's size: by the pupil_distance_mm where it is given, or else by irises and head model, or by the latter
+    alone where no iris is seen. surface, eyes: under the size of the model."""
+    found, eyeballs = None if eyes is None else eyes.gaze, eyeballs_of(surface)
+    if pupil_distance_mm is not None and eyeballs is not None:
+        if found is not None:
+            return scale_by_length(pupil_distance_mm, found.centres, found.centre_sigma)
+        centres = np.stack([ball.centre for ball in eyeballs])
+        return scale_by_length(pupil_distance_mm, centres, np.tile(CENTRE_SIGMA_MM, (2, 1)))
+    if found is None or not np.isfinite(found.iris_radius_mm):
+        return BY_MODEL
+    return scale_by_iris(found.iris_radius_mm, found.iris_radius_sigma_mm)

@@ -98,6 +98,16 @@ class HeadTrack:
     held_out_px: tuple[float, float]
     held_off: tuple[float, float] | None = None
 
+    def scaled(self, factor: float) -> HeadTrack:
+        """The same head, larger by a factor (of its lengths) and as much farther away: every picture of it stays."""
+        poses = self.camera_from_head.copy()
+        poses[:, :3, 3] *= factor
+        unit = np.r_[1.0, 1.0, 1.0, np.full(3, factor)]
+        fit = replace(self.fit, scale=factor * self.fit.scale, translation=factor * self.fit.translation,
+                      vertices=factor * self.fit.vertices)
+        return replace(self, camera_from_head=poses, covariance=self.covariance * np.outer(unit, unit), fit=fit,
+                       points_head=factor * self.points_head, sigma_mm=factor * self.sigma_mm)
+
 
 def track_head(
     clip: TrackedClip, model: HeadModel, settings: TrackSettings, progress: Callable, note: Callable[[str], None]

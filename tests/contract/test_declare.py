@@ -109,6 +109,13 @@ def test_subject_facts(tmp_path):
     assert (subject.focal_length_px, subject.transfer, subject.moves) == (None, "bt709", "camera")
 
 
+def test_a_pupil_distance_is_a_fact_of_the_subject_and_of_each_of_its_clips(tmp_path):
+    bare = load_subject(make_subject(tmp_path / "eve"))
+    known = load_subject(make_subject(tmp_path / "ada", settings="video: clip.txt\nhead: {pupil_distance_mm: 63}\n"))
+    assert bare.pupil_distance_mm is None and "pupil_distance_mm" not in bare.content()
+    assert known.content() == bare.content() | {"pupil_distance_mm": 63.0}
+
+
 def test_subject_names_files_of_another_tracker(tmp_path):
     folder = make_subject(tmp_path / "eve")
     bare = load_subject(folder)

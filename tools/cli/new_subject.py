@@ -26,6 +26,9 @@ colour: {{transfer: {transfer}}}
 # head: camera and light stand still, the head turns. camera: head and light still, the camera is carried around.
 capture: {{moves: {moves}}}
 
+# How far the pupils are apart when they look far away sets the head's size; left out, irises and a mean head do:
+# head: {{pupil_distance_mm: 63}}
+
 # A 24-patch colour chart in view is found by itself; by hand, or to leave it out:
 # chart: {{frame: 0, corners: [[x, y], [x, y], [x, y], [x, y]]}}   # or off
 """
