@@ -85,6 +85,20 @@ def read_maps(folder: Path) -> dict:
     return maps | {"specular_ior": modulated_ior(maps["specular_intensity"])}
 
 
+def read_eyes(job: Job, mesh, poses: dict) -> tuple:
+    """The right and the left Eyeball, which the asset shows as meshes of their own; none where the gaze was not solved
+    or the mesh has no eyes."""
+    from shared.geometry.eyeballs import eyeballs_of
+    from shared.geometry.surface import Surface
+    from shared.io.arrays import load_arrays, read_json
+
+    segment = load_arrays(job.input("inverse_render") / "mesh.npz").get("face_segment")
+    if "gaze" not in poses or segment is None:
+        return ()
+    names = read_json(job.input("track_landmarks") / "tracking.json")["segments"]
+    return eyeballs_of(Surface(mesh, segment, tuple(names))) or ()
+
+
 def write_images(job: Job, writer, maps: dict, envmap, frames, render_frames: list[int]) -> None:
     """maps/, envmap.exr and renders/ in the chosen precision and colour space."""
     from shared.io.export_maps import SOLVED_MAPS, paste_crop, write_png_copies
@@ -176,8 +190,9 @@ def light_moves(job: Job, moves: str) -> str:
     return "head" if job.manifest("inverse_render")["parameters"].get("light_model") == "camera" else moves
 
 
-def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, frames, solve: dict):
+def render_views(job: Job, writer, mesh, eyes, maps: dict, envmap, poses: dict, frames, solve: dict):
     """Writes views/novel_*.exr, views/relit_*.exr and the lights -> the ViewSet; None when switched off."""
+    from shared.imaging.turning_eyes import TurningEyes
     from shared.rendering.near_lamp import NearLamp
     from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
     from shared.rendering.views import held_out_cameras, make_views
@@ -188,6 +203,7 @@ def render_views(job: Job, writer, mesh, maps: dict, envmap, poses: dict, frames
     views = make_views(
         mesh, maps, envmap, camera_from_head=poses["camera_from_head"], moves=moves, pixels=job.params.view_size,
         held_out=cameras, progress=job.progress, lamp=NearLamp.of_record(solve.get("lamp") or {}),
+        eyes=TurningEyes(mesh, eyes) if eyes else None,
     )
     (job.out / "views").mkdir()
     pictures = {f"novel_{name}": picture for name, picture in views.novel.items()}
@@ -312,7 +328,8 @@ def run(job: Job) -> None:
         writer.write_colour(job.out / "envmap_far.exr", far, "radiance, clip maximum 1", latlong=True)
     asset = describe_asset(job, mesh, describe_capture(job, poses, frames), frames, writer, lamp)
     write_assets(job, asset, poses, maps, far)
-    views = render_views(job, writer, mesh, maps, envmap, poses, frames, solve)
+    eyes = read_eyes(job, mesh, poses)
+    views = render_views(job, writer, mesh, eyes, maps, envmap, poses, frames, solve)
     record = run_record(job, mesh, solve, time.perf_counter() - start)
     write_json(job.out / "run.json", record)
     methods = method_records(job, record, solve)

@@ -142,6 +142,8 @@ STAGE = Stage(
         Parameter("pose_rounds", int, 3, "Times, at most, that the frames are tracked again on the refined mesh; 0: "
                   "the tracked poses stay.", "", 0, 10),
         Parameter("normal_map", bool, True, "Solve relief finer than the mesh as a normal map; else it is flat."),
+        Parameter("eyes", bool, True, "Let the eyeballs turn with the gaze that track_landmarks found, and have a "
+                  "material of their own; off, they are parts of the skin that stay where they are."),
         Parameter("render_count", int, 8, "Frames to re-render, spread evenly.", "frames", 1, 2000),
         Parameter("mesh", str, "", "Mesh (.npz or .obj) to use instead of the tracked one; empty: tracked.",
                   file=True),
@@ -209,6 +211,8 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
     frames, index = clip.frames, clip.frame_index
     poses = result.views.camera_from_head[first : first + len(index)]
     covariance = {} if result.covariance is None else {"covariance": result.covariance}
+    turning = result.eyes is not None
+    gaze = result.views.gaze[first : first + len(index)] if turning else None
     save_arrays(
         folder / "poses.npz",
         camera_from_head=poses,
@@ -216,11 +220,14 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
         frame_index=index,
         intrinsics=frames.intrinsics_source,
         intrinsics_crop=frames.intrinsics,
+        **({"gaze": gaze} if turning else {}),
     )
     maps = SurfaceMaps(result.maps["diffuse_albedo"], result.maps["specular_intensity"])
     chosen = spread_frames(len(index), job.params.render_count)
     for f in job.progress(chosen, "re-rendering"):
-        image, _ = render_frame(result.viewer, result.shading, maps, first + f, poses[f], clip.lens, clip.views.size)
+        read_at = result.eyes.reader(gaze[f]) if turning else None
+        image, _ = render_frame(result.viewer, result.shading, maps, first + f, poses[f], clip.lens, clip.views.size,
+                                read_at=read_at)
         write_exr(folder / "renders" / f"{index[f]:06d}.exr", image, colour_space="lin_rec709_scene")
     held_out = index[~result.views.fitted[first : first + len(index)]]
     return {"render_frames": index[chosen].tolist(), "held_out_frames": held_out.tolist()}
@@ -228,6 +235,8 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
 
 def read_clips(job: Job) -> tuple:
     """The clip's inputs, or those of all clips."""
+    from dataclasses import replace
+
     from shared.inverse.clip_inputs import read_inputs
 
     params = job.params
@@ -237,7 +246,8 @@ def read_clips(job: Job) -> tuple:
         raise InputError("works on one clip only", where=f"--set inverse_render.{name}", got=f"{len(job.clips)} clips",
                          hint="leave it out, or make a subject of one clip")
     folders = [(job.input("sample_frames", clip), job.input("track_landmarks", clip)) for clip in job.clips or ("",)]
-    return tuple(read_inputs(*pair, params.mesh, params.poses) for pair in folders)
+    clips = tuple(read_inputs(*pair, params.mesh, params.poses) for pair in folders)
+    return clips if params.eyes else tuple(replace(clip, views=replace(clip.views, gaze=None)) for clip in clips)
 
 
 def write_shape(job: Job, tracked, mesh) -> None:

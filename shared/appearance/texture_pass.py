@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from shared.appearance.eye_albedo import IRIS_MM, round_albedo
 from shared.appearance.texture import (
     ERROR_OVER_SCATTER,
     IRRADIANCE_ERROR,
@@ -32,6 +33,7 @@ from shared.compute.threads import share_out
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer, is_inactive
 from shared.imaging.texels import FrameView, SmoothFields, TexelSamples, TexelSurface
+from shared.imaging.turning_eyes import EyeTexels
 from shared.imaging.views import Views
 from shared.rendering.shading import VertexShading
 
@@ -72,7 +74,8 @@ class TexturePass:
     light_weights: how much samples of each light count, by how well the model follows it; empty: all alike;
     region [V]: parts of the head, skin and hair, of which one says nothing of the other;
     bare [V] bool: bare skin, None: all; of brows, lips or clothes the skin around says nothing, however much frames
-    contradict each other there.
+    contradict each other there;
+    eyes: texels that turn with the views' gaze, and of which skin says nothing; None: none do.
     """
 
     def __init__(
@@ -89,8 +92,9 @@ class TexturePass:
         region: np.ndarray | None = None,
         bare: np.ndarray | None = None,
         context: RunContext = SILENT,
+        eyes: EyeTexels | None = None,
     ):
-        self.surface, self.viewer, self.shading, self.views = surface, viewer, shading, views
+        self.surface, self.viewer, self.shading, self.views, self.eyes = surface, viewer, shading, views, eyes
         self.typical_albedo = typical_albedo
         lights = views.frames_of_lights
         self.light_weights = tuple(light_weights) or (1.0,) * len(lights)
@@ -160,7 +164,8 @@ class TexturePass:
         view = self.viewer.view(pose, lens, picture.inside.shape[::-1])
         shadow = shading.shadow_uncertainty(f) * self.typical_albedo.astype(np.float32)
         values = np.concatenate([shading.irradiance(f), shading.reflection(f), shadow], axis=1)
-        return self.surface.frame_view(view, picture, lens, values)
+        frame = self.surface.frame_view(view, picture, lens, values)
+        return frame if self.eyes is None else self.eyes.turned(frame, view, views.gaze[f])
 
     def _share_out(self, view: FrameView, work: Callable[[LitSamples], Result]) -> list[Result]:
         """work(samples) for each block of the frame's texels, on several threads -> the results in order."""
@@ -212,11 +217,21 @@ class TexturePass:
             left = np.clip(believed - own, 0.0, 1.0) / np.maximum(1.0 - own, 1e-3)
             for k, specular in enumerate(intensities):
                 smooth = np.exp(self.surface.interpolate(around[..., k]))
+                if self.eyes is not None:
+                    smooth[self.eyes.rows] = self._round_eyes(rough[k], information)
                 brighter = (certain * np.log(np.maximum(rough[k], 1e-3) / smooth)).sum(1, keepdims=True) / total
                 albedo = equations.drawn_albedo(specular, smooth * np.exp(brighter * left), _ALBEDO_PULL, drawing)
                 albedo = np.minimum(albedo, brightest).astype(np.float32)
                 found.append(TexelMaterial(albedo, specular, information.min(1)))
         return found
+
+    def _round_eyes(self, rough: np.ndarray, information: np.ndarray) -> np.ndarray:
+        """[E, 3] albedo of the eyeballs' texels as those at the same angle have it, of a result [T, 3]."""
+        eyes = self.eyes
+        angle = np.arccos(np.clip(eyes.directions[:, 2], -1.0, 1.0))
+        iris = np.arcsin(IRIS_MM / np.mean([ball.radius for ball in eyes.eyes.balls]))
+        known = np.log(np.maximum(rough[eyes.rows], 1e-3))
+        return np.exp(round_albedo(angle, float(iris), known, information[eyes.rows]))
 
     def _surroundings(self, rough: list[np.ndarray], information: np.ndarray, fields: SmoothFields) -> np.ndarray:
         """[V, 3, K] log albedo as smooth fields, of K results [T, 3]: texels that the clip tells little of follow

@@ -11,6 +11,9 @@ from shared.contract.declare import Field
 
 FRAME_INDEX = Field("frame_index", "The frames, counted from 0 in the source.", "int64", "F")
 POSES = Field("camera_from_head", "The head's pose in each frame: a rigid motion.", "float64", "F, 4, 4", "mm")
+GAZE = Field("gaze", "Where the right and the left eye look: yaw to +x, pitch to +y in head space, 0 straight ahead; "
+             "NaN while an eye is shut. Absent where the gaze was not solved.", "float64", "F, 2, 2", "rad",
+             optional=True)
 SOURCE_LENS = Field("intrinsics", "The camera matrix of the full source frame.", "float64", "3, 3", "px")
 CROP_LENS = Field("intrinsics_crop", "The camera matrix of the crop.", "float64", "3, 3", "px")
 
@@ -175,7 +178,7 @@ INIT = (
     Field("seen_share", "Share of the head's texels that the frames show."),
 )
 
-SOLVED_POSES = (POSES, replace(COVARIANCE, optional=True), FRAME_INDEX, SOURCE_LENS, CROP_LENS)
+SOLVED_POSES = (POSES, replace(COVARIANCE, optional=True), FRAME_INDEX, SOURCE_LENS, CROP_LENS, GAZE)
 _REFERENCE = "solver=reference only:"
 _CANDIDATES = (
     Field("part", "Part of the model.", "text"),

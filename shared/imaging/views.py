@@ -18,7 +18,8 @@ class Views:
     camera_from_head [F, 4, 4] mm; intrinsics [F, 3, 3] px of pictures of size (width, height); moves: "head" or
     "camera", what moved against the light; light_index [F] int: which light each frame stands in, 0 first, frames of
     one light in a row; fitted [F] bool: the other frames are held out; read_picture(f), read_mask(f): see picture and
-    mask.
+    mask; gaze [F, 2, 2] radians: of the right and the left eye, NaN while shut (shared/geometry/eyeballs.py), None: not
+    known, so that eyeballs do not turn.
     """
 
     camera_from_head: np.ndarray
@@ -29,6 +30,7 @@ class Views:
     fitted: np.ndarray
     read_picture: Callable[[int], Picture]
     read_mask: Callable[[int], np.ndarray]
+    gaze: np.ndarray | None = None
 
     @classmethod
     def in_one_light(
@@ -40,6 +42,7 @@ class Views:
         read_picture: Callable[[int], Picture],
         read_mask: Callable[[int], np.ndarray],
         fitted: np.ndarray | None = None,
+        gaze: np.ndarray | None = None,
     ) -> Views:
         """All in one light through one lens [3, 3] px; fitted [F] bool, None: all; the others as of the class."""
         count = len(camera_from_head)
@@ -52,6 +55,7 @@ class Views:
             fitted=np.ones(count, bool) if fitted is None else fitted,
             read_picture=read_picture,
             read_mask=read_mask,
+            gaze=gaze,
         )
 
     def __len__(self) -> int:
@@ -84,4 +88,5 @@ class Views:
             fitted=self.fitted[frames] if fitted is None else fitted,
             read_picture=lambda k: self.picture(frames[k]),
             read_mask=lambda k: self.mask(frames[k]),
+            gaze=None if self.gaze is None else self.gaze[frames],
         )

@@ -80,7 +80,7 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
     poses = load_arrays(Path(pose_path)) if pose_path else tracked_poses
     points = None if mesh_path or pose_path else load_arrays(tracked / "tracks.npz")
     tracks = None if points is None else TrackPoints.tracked(points["points_head"], points["sigma_mm"])
-    camera_from_head, place = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
+    camera_from_head, place, gaze = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
     views = Views.in_one_light(
         camera_from_head=camera_from_head,
         lens=frames.intrinsics,
@@ -88,6 +88,7 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
         moves=frames.moves,
         read_picture=lambda f: read_picture(frames, int(place[f])),
         read_mask=lambda f: frames.read_mask(int(place[f])),
+        gaze=gaze,
     )
     surface = Surface(mesh, segment, tuple(tracking["segments"]), tracks)
     if tracks is None or tracking["held"]:
@@ -123,8 +124,9 @@ def read_mean_texture(folder: Path, mesh: Mesh) -> ClipTexture:
     return ClipTexture(mesh, read_exr(folder / "mean_texture.exr"), read_exr(folder / "weight.exr"))
 
 
-def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Poses of sampled frames [F, 4, 4] and their place in the frame set [F]."""
+def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Poses of sampled frames [F, 4, 4], their place in the frame set [F], and their gaze [F, 2, 2], None: not known.
+    """
     if "camera_from_head" not in poses:
         raise InputError("no camera_from_head", where=where, got=", ".join(sorted(poses)))
     pose = poses["camera_from_head"].astype(np.float64)
@@ -133,4 +135,5 @@ def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.nd
     kept = [i for i, frame in enumerate(index) if int(frame) in place]
     if len(kept) < 3:
         raise InputError("too few poses belong to sampled frames", where=where, got=len(kept), expected="3 or more")
-    return pose[kept], np.array([place[int(index[i])] for i in kept])
+    gaze = poses["gaze"][kept] if "gaze" in poses else None
+    return pose[kept], np.array([place[int(index[i])] for i in kept]), gaze

@@ -10,12 +10,13 @@ its own motion, which is far steadier than poses one by one, stays as it was.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from shared.capture.chart import ChartObservation
 from shared.errors import InputError
+from shared.geometry.eyeballs import gaze_direction, gaze_towards
 from shared.geometry.mesh import normalised
 from shared.geometry.surface import Surface
 from shared.geometry.transforms import (
@@ -78,8 +79,7 @@ def join_clips(clips: Sequence[ClipInputs], textures: Sequence[ClipTexture]) -> 
             if k != main:
                 matches = match_textures(textures[main], textures[k])
                 placed[k] = place_on_surface(clip.views, matches, clip.frames.source_name)
-    views = join_views([replace(clip.views, camera_from_head=own.camera_from_head)
-                        for clip, own in zip(clips, placed, strict=True)])
+    views = join_views([own.of(clip.views) for clip, own in zip(clips, placed, strict=True)])
     return JoinedClips(views, clips[main].surface, tuple(clips), main, tuple(placed))
 
 
@@ -96,7 +96,15 @@ def join_views(parts: Sequence[Views]) -> Views:
         fitted=np.concatenate([part.fitted for part in parts]),
         read_picture=lambda f: parts[owner[f]].picture(f - first[owner[f]]),
         read_mask=lambda f: parts[owner[f]].mask(f - first[owner[f]]),
+        gaze=_gaze_of_all(parts),
     )
+
+
+def _gaze_of_all(parts: Sequence[Views]) -> np.ndarray | None:
+    """[F, 2, 2]; views whose gaze is not known say as little of the eyes as shut ones; None where none is known."""
+    if all(part.gaze is None for part in parts):
+        return None
+    return np.concatenate([np.full((len(part), 2, 2), np.nan) if part.gaze is None else part.gaze for part in parts])
 
 
 def fit_similarity(
@@ -132,11 +140,19 @@ def fit_similarity(
 @dataclass(frozen=True, eq=False)
 class Placed:
     """A clip's poses [F, 4, 4] in the shared head space; matched: texels by which they were placed there, and match_px:
-    median distance of these from where the clip's own mesh put them."""
+    median distance of these from where the clip's own mesh put them; own_from_shared [3, 3]: turns directions."""
 
     camera_from_head: np.ndarray
     matched: int = 0
     match_px: float = 0.0
+    own_from_shared: np.ndarray = field(default_factory=lambda: np.eye(3))
+
+    def of(self, views: Views) -> Views:
+        """The clip's views in the shared head space."""
+        gaze = views.gaze
+        if gaze is not None and not np.array_equal(self.own_from_shared, np.eye(3)):
+            gaze = gaze_towards(gaze_direction(gaze) @ self.own_from_shared)
+        return replace(views, camera_from_head=self.camera_from_head, gaze=gaze)
 
 
 def place_on_surface(views: Views, matches: Matches, name: str) -> Placed:
@@ -155,4 +171,4 @@ def place_on_surface(views: Views, matches: Matches, name: str) -> Placed:
     back = Similarity(1.0 / own.scale, own.rotation.T, -own.rotation.T @ own.translation / own.scale)
     found = back.pose(poses)
     away = np.linalg.norm(project(chosen.first, found, lens)[0] - pixels, axis=-1)
-    return Placed(found, len(matches), float(np.nanmedian(away)))
+    return Placed(found, len(matches), float(np.nanmedian(away)), own.rotation)

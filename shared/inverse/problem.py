@@ -14,6 +14,7 @@ from shared.compute.run_context import RunContext
 from shared.geometry.surface import Surface
 from shared.imaging.frame_index import hold_out, spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
+from shared.imaging.turning_eyes import TurningEyes
 from shared.imaging.views import Views
 from shared.inverse.frame_choice import covering_frames
 from shared.published.settings import ReferenceSettings
@@ -57,7 +58,8 @@ class InverseSettings:
 class InverseResult:
     """solution of the appearance fit, the texels' material, maps by name, the vertices' shading in all views, the
     viewer of the final mesh, the views with their poses and which were fitted, and what is worth recording; covariance
-    [F, 6, 6] of poses that were tracked again, None: they are as they were given."""
+    [F, 6, 6] of poses that were tracked again, None: they are as they were given; eyes: those of the mesh, which turn
+    with the views' gaze, None: they do not."""
 
     solution: Solution
     material: TexelMaterial
@@ -67,6 +69,7 @@ class InverseResult:
     views: Views
     record: dict
     covariance: np.ndarray | None = None
+    eyes: TurningEyes | None = None
 
 
 def some_views(views: Views, settings: InverseSettings, wanted: int) -> Views:

@@ -23,6 +23,7 @@ from shared.geometry.mesh import uniform_laplacian
 from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import TexelSurface
+from shared.imaging.turning_eyes import EyeTexels, TurningEyes
 from shared.imaging.views import Views
 from shared.inverse.clip_inputs import TrackedPoses
 from shared.inverse.lamp_distance import describe_lamp, find_lamp
@@ -107,11 +108,13 @@ def solve_clip(
     lit = shaped = None  # texels need the memory that the points' samples and transfer take
     shading = shade_vertices(views, viewer, precomputed, settings.appearance, solution, context)
     texels = TexelSurface(surface.mesh, settings.map_size)
+    eyes = None if views.gaze is None else TurningEyes.of(surface)
+    eye_texels = None if eyes is None else EyeTexels(texels, viewer, eyes)
     typical = np.median(solution.state.albedo, axis=0)
     texture = TexturePass(
         texels, viewer, shading, views, specular=specular_at(texels, solution), typical_albedo=typical,
         light_weights=solution.light_weights, region=scalp_of(surface), bare=surface.vertices_of(FACE_SKIN),
-        context=context,
+        context=context, eyes=eye_texels,
     )
     widths = settings.map_size * np.array(settings.specular_widths if settings.appearance.specular else (np.inf,))
     material, texture_record = texture.run(widths)
@@ -119,6 +122,8 @@ def solve_clip(
     if settings.normal_map:
         fine = NormalPass(texels, viewer, shading, views, material, context)
         turn, relief = fine.run(resolved_texels(texels, views))
+        if eye_texels is not None:
+            turn[eye_texels.rows] = 0.0  # it was seen where the texel does not stay
         context.note(f"fine normals: {relief}")
     roughness, local = solution.state.roughness, solution.local_roughness_fit
     roughness = roughness if local is None else local.roughness(surface.mesh.vertices)
@@ -136,7 +141,7 @@ def solve_clip(
         "model_selection": selected.candidates,
     }
     maps = make_maps(texels, material, roughness, turn)
-    return InverseResult(solution, material, maps, shading, viewer, views, record, covariance)
+    return InverseResult(solution, material, maps, shading, viewer, views, record, covariance, eyes)
 
 
 def examine(

@@ -16,6 +16,7 @@ from shared.compute.compiled import compiled
 from shared.compute.threads import share_out
 from shared.geometry.raycast import camera_hits
 from shared.imaging.image_sampling import SurfaceViewer
+from shared.imaging.turning_eyes import ReadAt
 from shared.rendering.shading import VertexShading
 
 _ROWS_PER_BAND = 32
@@ -38,14 +39,16 @@ def render_frame(
     intrinsics: np.ndarray,
     size: tuple[int, int],
     samples: int = 2,
+    read_at: ReadAt | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Linear radiance [H, W, 3] and coverage [H, W] in [0, 1] of one frame; 0 outside the head.
 
-    size: (width, height); samples: rays per pixel along each axis. frame: the shading's frame. Radiance is the mean
-    over the rays that hit the head, so that partly covered pixels are not darkened.
+    size: (width, height); samples: rays per pixel along each axis. frame: the shading's frame; read_at: where the
+    texture lies elsewhere than in the map, as an eye's does that turns; None: nowhere. Radiance is the mean over the
+    rays that hit the head, so that partly covered pixels are not darkened.
     """
     (radiance,), coverage = render_lights(
-        viewer, shading, maps, [frame], camera_from_head, intrinsics, size, samples=samples
+        viewer, shading, maps, [frame], camera_from_head, intrinsics, size, samples=samples, read_at=read_at
     )
     return radiance, coverage
 
@@ -59,6 +62,7 @@ def render_lights(
     intrinsics: np.ndarray,
     size: tuple[int, int],
     samples: int = 2,
+    read_at: ReadAt | None = None,
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """As render_frame of several of the shading's frames in which the camera stands alike and the light may not: a
     ray is traced once for all of them. -> radiance [H, W, 3] of each, and their coverage [H, W]."""
@@ -83,8 +87,9 @@ def render_lights(
                 face, bary, _ = camera_hits(viewer.scene, camera_from_head, lens, width, rows, offsets)
                 face, bary = face.ravel(), bary.reshape(-1, 3)
                 hits[pixels] += face >= 0
+                read = (face, bary) if read_at is None else read_at(face, bary)
                 for shade, sent in zip(shades, radiance[:, pixels], strict=True):
-                    _add_radiance(face, bary, mesh.faces, mesh.face_uvs, uvs, albedo, intensity, shade, sent)
+                    _add_radiance(face, bary, *read, mesh.faces, mesh.face_uvs, uvs, albedo, intensity, shade, sent)
 
     share_out(-(-height // _ROWS_PER_BAND), render)
     radiance /= np.maximum(hits, 1.0)[:, None]
@@ -92,17 +97,19 @@ def render_lights(
 
 
 @compiled
-def _add_radiance(face, bary, faces, face_uvs, uvs, albedo, specular_intensity, shade, radiance):
-    """Adds to radiance [N, 3] what rays see: face [N] (-1: nothing), bary [N, 3]; shade [V, 6]: E and S;
-    maps as by texture.sample_bilinear."""
+def _add_radiance(
+    face, bary, texture_face, texture_bary, faces, face_uvs, uvs, albedo, specular_intensity, shade, radiance
+):
+    """Adds to radiance [N, 3] what rays see: face [N] (-1: nothing), bary [N, 3], and where the texture is read;
+    shade [V, 6]: E and S; maps as by texture.sample_bilinear."""
     one, half, size = np.float32(1.0), np.float32(0.5), len(albedo)
     for n in range(len(face)):
         if face[n] < 0:
             continue
         u, v = np.float32(0.0), np.float32(0.0)
         for k in range(3):
-            u += bary[n, k] * uvs[face_uvs[face[n], k], 0]
-            v += bary[n, k] * uvs[face_uvs[face[n], k], 1]
+            u += texture_bary[n, k] * uvs[face_uvs[texture_face[n], k], 0]
+            v += texture_bary[n, k] * uvs[face_uvs[texture_face[n], k], 1]
         x, y = u * size - half, (one - v) * size - half
         left, top = int(np.floor(x)), int(np.floor(y))
         fx, fy = x - np.float32(left), y - np.float32(top)

@@ -19,6 +19,7 @@ from shared.geometry.transforms import camera_centres, rigid, world_from_head
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texture import sample_bilinear
+from shared.imaging.turning_eyes import ReadAt, TurningEyes
 from shared.rendering.envmap import cube_from_latlong, latlong_directions, latlong_lookup
 from shared.rendering.near_lamp import NearLamp
 from shared.rendering.precomputed_transfer import Sizes, precompute_transfer
@@ -44,11 +45,13 @@ HELD_OUT_SHOWN = 4
 
 @dataclass(frozen=True)
 class ViewCamera:
-    """camera_from_head [4, 4] mm, intrinsics [3, 3] px of a picture of size (width, height)."""
+    """camera_from_head [4, 4] mm, intrinsics [3, 3] px of a picture of size (width, height); gaze [2, 2] radians of the
+    head that it looks at, None: straight ahead."""
 
     camera_from_head: np.ndarray
     intrinsics: np.ndarray
     size: tuple[int, int]
+    gaze: np.ndarray | None = None
 
 
 def make_views(
@@ -61,13 +64,16 @@ def make_views(
     held_out: Mapping[int, ViewCamera],
     progress: Callable | None = None,
     lamp: NearLamp | None = None,
+    eyes: TurningEyes | None = None,
 ) -> ViewSet:
     """All of them, pixels wide. maps and progress as for HeadViews; envmap [H, 2 H, 3], camera_from_head [F, 4, 4] and
     moves of the clip; held_out: frames of the clip to re-render, with their cameras; lamp: of its light, where it
-    stands near: for those frames, while from elsewhere the head is seen under the light as its mean place has it."""
+    stands near: for those frames, while from elsewhere the head is seen under the light as its mean place has it;
+    eyes: those of the mesh, which turn with the cameras' gaze."""
     around = [orbit_camera(mesh, *place, pixels) for place in NOVEL_VIEWS.values()]
     camera, front = orbit_camera(mesh, RELIT_YAW_DEG, 0.0, pixels), orbit_camera(mesh, 0.0, 0.0, pixels)
-    views = HeadViews(mesh, maps, VIEW_SIZES, [*around, camera, front, *held_out.values()], progress)
+    cameras = [*around, camera, front, *held_out.values()]
+    views = HeadViews(mesh, maps, VIEW_SIZES, cameras, progress, eyes=eyes)
     novel = views.render(clip_light(envmap, camera_from_head, moves), around)
     again = views.render(envmap, list(held_out.values()), moves, fade=False, lamp=lamp) if held_out else []
     covered = share_out(len(ROUGHNESSES), lambda k: views.visibility(front, ROUGHNESSES[k]))
@@ -106,7 +112,13 @@ def held_out_cameras(
     rest = [frame for frame in solve.get("held_out_frames", ()) if frame in place and frame not in done]
     chosen = [rest[i] for i in spread_frames(len(rest), HELD_OUT_SHOWN)] if rest else []
     lens = poses.get("intrinsics_crop", intrinsics)
-    return {frame: ViewCamera(poses["camera_from_head"][place[frame]], lens, size) for frame in chosen}
+    return {frame: clip_camera(poses, place[frame], lens, size) for frame in chosen}
+
+
+def clip_camera(poses: Mapping[str, np.ndarray], f: int, lens: np.ndarray, size: tuple[int, int]) -> ViewCamera:
+    """Camera f of a poses.npz with a lens [3, 3] and a picture's size (width, height), px, and the gaze if it has one.
+    """
+    return ViewCamera(poses["camera_from_head"][f], lens, size, poses["gaze"][f] if "gaze" in poses else None)
 
 
 def frontal_frame(camera_from_head: np.ndarray) -> int:
@@ -126,7 +138,7 @@ class HeadViews:
     maps: diffuse_albedo [S, S, 3], specular_intensity [S, S], roughness [S, S]. cameras: all that will look at it, so
     that only what they can see is traced; none: everything; only [V]: vertices that matter, all by default.
     progress(items, label) wraps the trace. light_resolution: edge of the cubemap that lights are seen through; deep:
-    see VertexShading; over 1 where cavities are exact.
+    see VertexShading; over 1 where cavities are exact; eyes: those of the mesh, None: they do not turn.
     """
 
     def __init__(
@@ -139,8 +151,9 @@ class HeadViews:
         light_resolution: int = LIGHT_RESOLUTION,
         deep: float = DEEP,
         only: np.ndarray | None = None,
+        eyes: TurningEyes | None = None,
     ):
-        self.light_resolution, self.deep = light_resolution, deep
+        self.light_resolution, self.deep, self.eyes = light_resolution, deep, eyes
         self.viewer = SurfaceViewer.of(mesh)
         self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"])
         self.precomputed = precompute_transfer(self.viewer, sizes or Sizes())
@@ -201,7 +214,8 @@ class HeadViews:
         """A picture, as of render, for each of several lights, given in head space."""
         shading = self._shading(lights, [camera] * len(lights), "camera")
         pictures, covered = render_lights(
-            self.viewer, shading, self.maps, range(len(lights)), camera.camera_from_head, camera.intrinsics, camera.size
+            self.viewer, shading, self.maps, range(len(lights)), camera.camera_from_head, camera.intrinsics,
+            camera.size, read_at=self._read_at(camera),
         )
         return [picture * covered[..., None] for picture in pictures]
 
@@ -210,10 +224,14 @@ class HeadViews:
         pictures = []
         for k, camera in enumerate(cameras):
             picture, covered = render_frame(
-                self.viewer, shading, self.maps, k, camera.camera_from_head, camera.intrinsics, camera.size
+                self.viewer, shading, self.maps, k, camera.camera_from_head, camera.intrinsics, camera.size,
+                read_at=self._read_at(camera),
             )
             pictures.append(picture * covered[..., None] if fade else picture)
         return pictures
+
+    def _read_at(self, camera: ViewCamera) -> ReadAt | None:
+        return None if self.eyes is None else self.eyes.reader(camera.gaze)
 
     def _shading(
         self, lights: Sequence[np.ndarray], cameras: Sequence[ViewCamera], moves: str, lamp: NearLamp | None = None

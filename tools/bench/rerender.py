@@ -14,15 +14,17 @@ import numpy as np
 from shared.errors import InputError
 from shared.geometry.mesh import interpolate
 from shared.geometry.raycast import camera_hits
+from shared.geometry.surface import Surface
 from shared.imaging.color import CLIPPED_CODE
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.texture import sample_bilinear
+from shared.imaging.turning_eyes import TurningEyes
 from shared.inverse.problem import FACE_SKIN
 from shared.io.arrays import load_arrays, read_json
 from shared.io.frames import FrameSet
 from shared.rendering.precomputed_transfer import Sizes
 from shared.rendering.studio_lights import studio_light
-from shared.rendering.views import HeadViews, ViewCamera
+from shared.rendering.views import HeadViews, ViewCamera, clip_camera
 from tools.relight.inputs import Asset, open_asset
 from tools.scoring.held_out import HeldOutFrame
 
@@ -55,7 +57,9 @@ class SolvedClip:
             raise InputError("the mesh has no face segments", where=str(work / "inverse_render" / "mesh.npz"))
         names = read_json(work / "track_landmarks" / "tracking.json")["segments"]
         self.segment_names = np.array(names)[segment]
-        self.views = HeadViews(self.asset.mesh, self.asset.maps, SIZES, [item.camera for item in self.held_out])
+        eyes = TurningEyes.of(Surface(self.asset.mesh, segment, tuple(names)))
+        cameras = [item.camera for item in self.held_out]
+        self.views = HeadViews(self.asset.mesh, self.asset.maps, SIZES, cameras, eyes=eyes)
 
     def compared(self) -> list[HeldOutFrame]:
         """Every held-out frame beside its re-render under the clip's light."""
@@ -128,7 +132,6 @@ def _held_out(work: Path, frames: FrameSet, at_most: int) -> list[HeldOutCamera]
         raise InputError("no frame was held out", where=str(work / "inverse_render" / "solve.json"))
     chosen = spread_frames(len(numbers), at_most) if at_most else range(len(numbers))
     return [
-        HeldOutCamera(frame, frames.position(frame), ViewCamera(solved["camera_from_head"][place[frame]], lens,
-                                                                frames.size))
+        HeldOutCamera(frame, frames.position(frame), clip_camera(solved, place[frame], lens, frames.size))
         for frame in (numbers[k] for k in chosen)
     ]  # fmt: skip

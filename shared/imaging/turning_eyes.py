@@ -1,0 +1,135 @@
+"""Eyeballs that turn in a mesh that does not: an eyeball is close to a ball, so its gaze moves no surface, only which
+texel lies where.
+
+What belongs to a place in head space stays there: where cameras see it, what covers it, the light that it gets. A texel
+takes all of that from the place to which the gaze turns it, and a ray that meets the eyeball reads the texture at the
+place from which the gaze turned what lies there. Eyeballs are no exact spheres; a direction from the centre has one
+place on them all the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from shared.geometry.eyeballs import Eyeball, eyeballs_of, gaze_rotation
+from shared.geometry.mesh import Mesh, interpolate, normalised, tangent_frames
+from shared.geometry.raycast import RAY_START_MM, RayScene
+from shared.geometry.surface import Surface
+from shared.imaging.image_sampling import SurfaceViewer, View
+from shared.imaging.texels import FrameView, TexelSurface
+
+ReadAt = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Faces [N] that rays meet (-1: none) and corner weights [N, 3] -> where on the surface their texture is read."""
+LID_MARGIN_MM = 1.0
+"""Whatever of an eyeball is so close to what covers it counts as hidden: lids are off by that, and have lashes."""
+
+
+class TurningEyes:
+    """The two eyeballs of a mesh: balls, right and left; side [F] int8: which of them a face belongs to, -1: none."""
+
+    def __init__(self, mesh: Mesh, balls: tuple[Eyeball, Eyeball]):
+        self.mesh, self.balls = mesh, balls
+        self.side = np.full(len(mesh.faces), -1, np.int8)
+        for k, ball in enumerate(balls):
+            self.side[ball.faces] = k
+        self._scenes = [RayScene(mesh.vertices, mesh.faces[ball.faces]) for ball in balls]
+
+    @classmethod
+    def of(cls, surface: Surface) -> TurningEyes | None:
+        """Those of a head; None where its mesh has none."""
+        balls = eyeballs_of(surface)
+        return None if balls is None else cls(surface.mesh, balls)
+
+    def directions(self, side: int, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+        """[n, 3] unit: from the centre of an eyeball to places on its faces [n] with corner weights [n, 3]."""
+        return normalised(interpolate(self.mesh.vertices, self.mesh.faces, face, bary) - self.balls[side].centre)
+
+    def place(self, side: int, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Face [n] int and corner weights [n, 3] of the places where unit directions [n, 3] from the centre of an
+        eyeball meet it."""
+        ball = self.balls[side]
+        face, bary, _ = self._scenes[side].intersect(np.broadcast_to(ball.centre, directions.shape), directions)
+        missed = np.nonzero(face < 0)[0]
+        if len(missed):  # single precision slips through between two faces: the nearest vertex is next to the place
+            corner = directions[missed] @ normalised(self.mesh.vertices[ball.vertices] - ball.centre).T
+            at = self.mesh.faces[ball.faces] == ball.vertices[corner.argmax(1)][:, None, None]
+            face[missed], bary[missed] = at.any(2).argmax(1), at[np.arange(len(missed)), at.any(2).argmax(1)]
+        return ball.faces[face], bary
+
+    def reader(self, gaze: np.ndarray | None) -> ReadAt | None:
+        """read_at of one gaze [2, 2]; None: the eyes look straight ahead."""
+        return None if gaze is None else lambda face, bary: self.read_at(face, bary, gaze)
+
+    def read_at(self, face: np.ndarray, bary: np.ndarray, gaze: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where rays that meet faces [n] (-1: none) with corner weights [n, 3] read the texture -> the same for it.
+
+        gaze [2, 2] radians, right and left; NaN: that eye looks straight ahead, as a shut one has no gaze.
+        """
+        face, bary = face.copy(), bary.copy()
+        owner = np.where(face >= 0, self.side[face], -1)
+        for side in np.nonzero(np.isfinite(gaze).all(1))[0]:
+            own = np.nonzero(owner == side)[0]
+            if len(own):
+                seen = self.directions(side, face[own], bary[own])
+                face[own], bary[own] = self.place(side, seen @ gaze_rotation(gaze[side]))
+        return face, bary
+
+
+class EyeTexels:
+    """The texels of a map that lie on the eyeballs: rows [E] of its surface, growing; side [E] int8 and directions
+    [E, 3] unit from the centre, as the eye looks straight ahead."""
+
+    def __init__(self, surface: TexelSurface, viewer: SurfaceViewer, eyes: TurningEyes):
+        self.surface, self.viewer, self.eyes = surface, viewer, eyes
+        self.rows = np.nonzero(eyes.side[surface.face] >= 0)[0]
+        self.side = eyes.side[surface.face[self.rows]]
+        self.directions = np.empty((len(self.rows), 3))
+        for side in (0, 1):
+            own = self.side == side
+            rows = self.rows[own]
+            self.directions[own] = eyes.directions(side, surface.face[rows], surface.bary[rows])
+
+    def turned(self, frame: FrameView, view: View, gaze: np.ndarray) -> FrameView:
+        """A frame with the eyeballs' texels where the gaze [2, 2] radians has turned them; of a shut eye, NaN, it shows
+        none. view: the camera's of all vertices."""
+        picture = frame.picture.inside.shape[::-1]
+        parts = [self._of_eye(side, frame, view, gaze[side], picture)
+                 for side in np.nonzero(np.isfinite(gaze).all(1))[0]]
+        rows = np.concatenate([np.empty(0, int), *(part[0] for part in parts)])
+        values = np.concatenate([np.empty((0, frame.table.shape[1]), np.float32), *(part[1] for part in parts)])
+        order = np.argsort(rows)
+        still = np.setdiff1d(frame.rows, self.rows, assume_unique=True)
+        return replace(frame, rows=np.sort(np.concatenate([still, rows])), moved=rows[order],
+                       moved_values=values[order])
+
+    def _of_eye(
+        self, side: int, frame: FrameView, view: View, gaze: np.ndarray, size: tuple[int, int]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The rows [n] of one eye that the frame shows, and the table's values [n, 4 + C] at their places."""
+        viewer, faces = self.viewer, self.surface.mesh.faces
+        rows = self.rows[self.side == side]
+        face, bary = self.eyes.place(side, self.directions[self.side == side] @ gaze_rotation(gaze).T)
+        values = interpolate(frame.table, faces, face, bary)
+        cosine = interpolate(view.cosine, faces, face, bary)
+        x, y = (values[:, :2] / values[:, 2:3]).T
+        inside = (1.0 < x) & (x < size[0] - 1.0) & (1.0 < y) & (y < size[1] - 1.0)
+        shown = np.nonzero(inside & (values[:, 2] > 0.0) & (cosine > viewer.least_cosine))[0]
+        face, bary = face[shown], bary[shown]
+        normals = normalised(interpolate(viewer.normals, faces, face, bary))
+        towards = normalised(interpolate(view.towards_camera, faces, face, bary))
+        places = interpolate(self.surface.mesh.vertices, faces, face, bary) + RAY_START_MM * normals
+        shown = shown[~self._covered(places, normals, towards)]
+        values[shown, 3] = np.square(cosine[shown])
+        return rows[shown], values[shown].astype(np.float32)
+
+    def _covered(self, places: np.ndarray, normals: np.ndarray, towards: np.ndarray) -> np.ndarray:
+        """[n] bool: does something lie between the camera and a place, or what is within the margin about it."""
+        covered = self.viewer.scene.occluded(places, towards)
+        across = tangent_frames(normals)
+        for step in (across[:, 0], -across[:, 0], across[:, 1], -across[:, 1]):
+            left = np.nonzero(~covered)[0]
+            covered[left] = self.viewer.scene.occluded(places[left] + LID_MARGIN_MM * step[left], towards[left])
+        return covered
