@@ -201,6 +201,8 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
 
     clip: its ClipInputs; first: of its frames, among all that were solved; light [6 n^2, 3].
     """
+    import numpy as np
+
     from shared.imaging.frame_index import spread_frames
     from shared.io.arrays import save_arrays
     from shared.io.images import write_exr
@@ -212,7 +214,8 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
     poses = result.views.camera_from_head[first : first + len(index)]
     covariance = {} if result.covariance is None else {"covariance": result.covariance}
     turning = result.eyes is not None
-    gaze = result.views.gaze[first : first + len(index)] if turning else None
+    turn = result.views.gaze[first : first + len(index)] if turning else None
+    gaze = np.full_like(turn, np.nan) if turning and clip.gaze is None else clip.gaze
     save_arrays(
         folder / "poses.npz",
         camera_from_head=poses,
@@ -220,12 +223,12 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
         frame_index=index,
         intrinsics=frames.intrinsics_source,
         intrinsics_crop=frames.intrinsics,
-        **({"gaze": gaze} if turning else {}),
+        **({"gaze": gaze, "eye_turn": turn} if turning else {}),
     )
     maps = SurfaceMaps(result.maps["diffuse_albedo"], result.maps["specular_intensity"])
     chosen = spread_frames(len(index), job.params.render_count)
     for f in job.progress(chosen, "re-rendering"):
-        read_at = result.eyes.reader(gaze[f]) if turning else None
+        read_at = result.eyes.reader(turn[f]) if turning else None
         image, _ = render_frame(result.viewer, result.shading, maps, first + f, poses[f], clip.lens, clip.views.size,
                                 read_at=read_at)
         write_exr(folder / "renders" / f"{index[f]:06d}.exr", image, colour_space="lin_rec709_scene")

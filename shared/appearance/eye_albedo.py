@@ -37,9 +37,11 @@ def round_albedo(
     chain = np.diag(np.append(step, 0.0) + np.insert(step, 0, 0.0)) - np.diag(step, 1) - np.diag(step, -1)
     white = np.zeros(count)
     white[-1] = 1.0
-    # Brightness and tint of the white are known unequally well; both act on the bin that nothing shows.
+    # The white is about neutral everywhere, and as bright as usual where nothing shows it, right behind.
     usual = np.full((3, 3), WHITE_SIGMA**2) + WHITE_TINT**2 * np.eye(3)
+    neutral = (np.eye(3) - 1.0 / 3.0) / WHITE_TINT**2
     matrix = np.kron(np.eye(3), chain) + np.diag(known.T.ravel()) + np.kron(np.linalg.inv(usual), np.diag(white))
+    matrix += np.kron(neutral, np.diag(np.arange(count) > rim))
     right = (known * means).T.ravel() + np.kron(np.linalg.inv(usual) @ np.full(3, USUAL_WHITE), white)
     return np.linalg.solve(matrix, right).reshape(3, count).T[bins]
 

@@ -165,7 +165,9 @@ class TexturePass:
         shadow = shading.shadow_uncertainty(f) * self.typical_albedo.astype(np.float32)
         values = np.concatenate([shading.irradiance(f), shading.reflection(f), shadow], axis=1)
         frame = self.surface.frame_view(view, picture, lens, values)
-        return frame if self.eyes is None else self.eyes.turned(frame, view, views.gaze[f])
+        if self.eyes is None:
+            return frame
+        return self.eyes.turned(frame, view, views.gaze[f], None if views.lids_px is None else views.lids_px[f])
 
     def _share_out(self, view: FrameView, work: Callable[[LitSamples], Result]) -> list[Result]:
         """work(samples) for each block of the frame's texels, on several threads -> the results in order."""

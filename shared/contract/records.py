@@ -14,6 +14,9 @@ POSES = Field("camera_from_head", "The head's pose in each frame: a rigid motion
 GAZE = Field("gaze", "Where the right and the left eye look: yaw to +x, pitch to +y in head space, 0 straight ahead; "
              "NaN while an eye is shut. Absent where the gaze was not solved.", "float64", "F, 2, 2", "rad",
              optional=True)
+EYE_TURN = Field("eye_turn", "The same with which the mesh's eyeballs, turned about their own centres, show the irises "
+                 "where the clip does: a fitted head's are some millimetres off.", "float64", "F, 2, 2", "rad",
+                 optional=True)
 SOURCE_LENS = Field("intrinsics", "The camera matrix of the full source frame.", "float64", "3, 3", "px")
 CROP_LENS = Field("intrinsics_crop", "The camera matrix of the crop.", "float64", "3, 3", "px")
 
@@ -178,7 +181,8 @@ INIT = (
     Field("seen_share", "Share of the head's texels that the frames show."),
 )
 
-SOLVED_POSES = (POSES, replace(COVARIANCE, optional=True), FRAME_INDEX, SOURCE_LENS, CROP_LENS, GAZE)
+SOLVED_POSES = (POSES, replace(COVARIANCE, optional=True), FRAME_INDEX, SOURCE_LENS, CROP_LENS, GAZE,
+                EYE_TURN)
 _REFERENCE = "solver=reference only:"
 _CANDIDATES = (
     Field("part", "Part of the model.", "text"),

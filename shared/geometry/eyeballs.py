@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shared.geometry.mesh import normalised
 from shared.geometry.surface import Surface
 
 SIDES = ("right", "left")
@@ -68,6 +69,20 @@ def gaze_towards(direction: np.ndarray) -> np.ndarray:
     """Directions [..., 3] in head space, of any length -> gaze [..., 2]; the inverse of gaze_direction."""
     x, y, z = np.moveaxis(direction, -1, 0)
     return np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1)
+
+
+def gaze_shown(ball: Eyeball, irises: np.ndarray, cameras: np.ndarray) -> np.ndarray:
+    """Gaze [F, 2] with which a mesh's eyeball shows an iris where cameras see it: a fitted head's eyeball is some
+    millimetres off in centre and size, which an iris' place [F, 3] in head space, mm, need not follow.
+
+    cameras [F, 3]: centres in head space. Where the line of sight passes by the eyeball: its point nearest to it.
+    """
+    sight = normalised(irises - cameras)
+    away = ball.centre - cameras
+    nearest = (away * sight).sum(-1, keepdims=True)
+    beside = (away**2).sum(-1, keepdims=True) - nearest**2
+    front = np.sqrt(np.maximum(ball.radius**2 - beside, 0.0))
+    return gaze_towards((nearest - front) * sight - away)
 
 
 def gaze_rotation(gaze: np.ndarray) -> np.ndarray:

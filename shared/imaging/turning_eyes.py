@@ -24,7 +24,8 @@ from shared.imaging.texels import FrameView, TexelSurface
 ReadAt = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Faces [N] that rays meet (-1: none) and corner weights [N, 3] -> where on the surface their texture is read."""
 LID_MARGIN_MM = 1.0
-"""Whatever of an eyeball is so close to what covers it counts as hidden: lids are off by that, and have lashes."""
+"""What of an eyeball is so close to what covers it counts less or not: lids are off by that, and have lashes."""
+LIDS = ("lids", "eye_sockets")
 
 
 class TurningEyes:
@@ -80,10 +81,15 @@ class TurningEyes:
 
 class EyeTexels:
     """The texels of a map that lie on the eyeballs: rows [E] of its surface, growing; side [E] int8 and directions
-    [E, 3] unit from the centre, as the eye looks straight ahead."""
+    [E, 3] unit from the centre, as the eye looks straight ahead.
 
-    def __init__(self, surface: TexelSurface, viewer: SurfaceViewer, eyes: TurningEyes):
+    lids [F] bool: faces that cover nothing in frames whose lids are known from the picture, since lids move, and a
+    mesh's are off.
+    """
+
+    def __init__(self, surface: TexelSurface, viewer: SurfaceViewer, eyes: TurningEyes, lids: np.ndarray):
         self.surface, self.viewer, self.eyes = surface, viewer, eyes
+        self._but_lids = RayScene(eyes.mesh.vertices, eyes.mesh.faces[~lids & (eyes.side < 0)])
         self.rows = np.nonzero(eyes.side[surface.face] >= 0)[0]
         self.side = eyes.side[surface.face[self.rows]]
         self.directions = np.empty((len(self.rows), 3))
@@ -92,12 +98,14 @@ class EyeTexels:
             rows = self.rows[own]
             self.directions[own] = eyes.directions(side, surface.face[rows], surface.bary[rows])
 
-    def turned(self, frame: FrameView, view: View, gaze: np.ndarray) -> FrameView:
+    def turned(self, frame: FrameView, view: View, gaze: np.ndarray, lids_px: np.ndarray | None = None) -> FrameView:
         """A frame with the eyeballs' texels where the gaze [2, 2] radians has turned them; of a shut eye, NaN, it shows
-        none. view: the camera's of all vertices."""
-        picture = frame.picture.inside.shape[::-1]
-        parts = [self._of_eye(side, frame, view, gaze[side], picture)
-                 for side in np.nonzero(np.isfinite(gaze).all(1))[0]]
+        none. view: the camera's of all vertices; lids_px [2, N, 2]: of each eye, see Views."""
+        known = np.isfinite(gaze).all(1)
+        if lids_px is not None:
+            known &= np.isfinite(lids_px).all((1, 2))
+        parts = [self._of_eye(side, frame, view, gaze[side], None if lids_px is None else lids_px[side])
+                 for side in np.nonzero(known)[0]]
         rows = np.concatenate([np.empty(0, int), *(part[0] for part in parts)])
         values = np.concatenate([np.empty((0, frame.table.shape[1]), np.float32), *(part[1] for part in parts)])
         order = np.argsort(rows)
@@ -106,23 +114,30 @@ class EyeTexels:
                        moved_values=values[order])
 
     def _of_eye(
-        self, side: int, frame: FrameView, view: View, gaze: np.ndarray, size: tuple[int, int]
+        self, side: int, frame: FrameView, view: View, gaze: np.ndarray, lids_px: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """The rows [n] of one eye that the frame shows, and the table's values [n, 4 + C] at their places."""
-        viewer, faces = self.viewer, self.surface.mesh.faces
+        viewer, faces, size = self.viewer, self.surface.mesh.faces, frame.picture.inside.shape[::-1]
         rows = self.rows[self.side == side]
         face, bary = self.eyes.place(side, self.directions[self.side == side] @ gaze_rotation(gaze).T)
         values = interpolate(frame.table, faces, face, bary)
         cosine = interpolate(view.cosine, faces, face, bary)
-        x, y = (values[:, :2] / values[:, 2:3]).T
-        inside = (1.0 < x) & (x < size[0] - 1.0) & (1.0 < y) & (y < size[1] - 1.0)
-        shown = np.nonzero(inside & (values[:, 2] > 0.0) & (cosine > viewer.least_cosine))[0]
+        pixels = values[:, :2] / values[:, 2:3]
+        shown = (pixels > 1.0).all(1) & (pixels < np.subtract(size, 1.0)).all(1) & (values[:, 2] > 0.0)
+        values[:, 3] = np.where(shown & (cosine > viewer.least_cosine), np.square(cosine), 0.0)
+        if lids_px is not None:
+            inside_mm = depth_in_polygon(pixels, lids_px) * values[:, 2] / frame.focal_length
+            values[:, 3] *= np.clip(inside_mm / LID_MARGIN_MM - 0.5, 0.0, 1.0)
+        shown = np.nonzero(values[:, 3] > 0.0)[0]
         face, bary = face[shown], bary[shown]
         normals = normalised(interpolate(viewer.normals, faces, face, bary))
         towards = normalised(interpolate(view.towards_camera, faces, face, bary))
         places = interpolate(self.surface.mesh.vertices, faces, face, bary) + RAY_START_MM * normals
-        shown = shown[~self._covered(places, normals, towards)]
-        values[shown, 3] = np.square(cosine[shown])
+        if lids_px is None:
+            covered = self._covered(places, normals, towards)
+        else:
+            covered = self._but_lids.occluded(places, towards)
+        shown = shown[~covered]
         return rows[shown], values[shown].astype(np.float32)
 
     def _covered(self, places: np.ndarray, normals: np.ndarray, towards: np.ndarray) -> np.ndarray:
@@ -133,3 +148,15 @@ class EyeTexels:
             left = np.nonzero(~covered)[0]
             covered[left] = self.viewer.scene.occluded(places[left] + LID_MARGIN_MM * step[left], towards[left])
         return covered
+
+
+def depth_in_polygon(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
+    """[n] distance of points [n, 2] from the border of a polygon [N, 2], its corners in order; negative outside."""
+    start, along = polygon, np.roll(polygon, -1, axis=0) - polygon
+    off = points[:, None] - start
+    share = np.clip((off * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-12), 0.0, 1.0)
+    distance = np.linalg.norm(off - share[..., None] * along, axis=-1).min(1)
+    across = (off[..., 1] < 0.0) != (off[..., 1] < along[:, 1])
+    rise = np.where(along[:, 1] == 0.0, 1.0, along[:, 1])
+    crossings = across & (off[..., 0] < off[..., 1] / rise * along[:, 0])
+    return np.where(crossings.sum(1) % 2 == 1, distance, -distance)

@@ -18,8 +18,9 @@ class Views:
     camera_from_head [F, 4, 4] mm; intrinsics [F, 3, 3] px of pictures of size (width, height); moves: "head" or
     "camera", what moved against the light; light_index [F] int: which light each frame stands in, 0 first, frames of
     one light in a row; fitted [F] bool: the other frames are held out; read_picture(f), read_mask(f): see picture and
-    mask; gaze [F, 2, 2] radians: of the right and the left eye, NaN while shut (shared/geometry/eyeballs.py), None: not
-    known, so that eyeballs do not turn.
+    mask; gaze [F, 2, 2] radians: with which the mesh's right and left eyeball show the irises where the pictures do,
+    NaN while shut (shared/geometry/eyeballs.py), None: not known, so that eyeballs do not turn; lids_px [F, 2, N, 2]: a
+    polygon about what the lids leave open of each eye, NaN where it is not seen, None: as the mesh has it.
     """
 
     camera_from_head: np.ndarray
@@ -31,6 +32,7 @@ class Views:
     read_picture: Callable[[int], Picture]
     read_mask: Callable[[int], np.ndarray]
     gaze: np.ndarray | None = None
+    lids_px: np.ndarray | None = None
 
     @classmethod
     def in_one_light(
@@ -43,6 +45,7 @@ class Views:
         read_mask: Callable[[int], np.ndarray],
         fitted: np.ndarray | None = None,
         gaze: np.ndarray | None = None,
+        lids_px: np.ndarray | None = None,
     ) -> Views:
         """All in one light through one lens [3, 3] px; fitted [F] bool, None: all; the others as of the class."""
         count = len(camera_from_head)
@@ -56,6 +59,7 @@ class Views:
             read_picture=read_picture,
             read_mask=read_mask,
             gaze=gaze,
+            lids_px=lids_px,
         )
 
     def __len__(self) -> int:
@@ -89,4 +93,5 @@ class Views:
             read_picture=lambda k: self.picture(frames[k]),
             read_mask=lambda k: self.mask(frames[k]),
             gaze=None if self.gaze is None else self.gaze[frames],
+            lids_px=None if self.lids_px is None else self.lids_px[frames],
         )

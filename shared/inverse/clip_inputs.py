@@ -11,8 +11,10 @@ import numpy as np
 from shared.capture.chart import ChartObservation
 from shared.compute.parallel import in_order
 from shared.errors import InputError
+from shared.geometry.eyeballs import eyeballs_of, gaze_direction, gaze_shown
 from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface, TrackPoints
+from shared.geometry.transforms import camera_centres
 from shared.imaging.color import decode_transfer, eight_bit
 from shared.imaging.image_sampling import Picture, prepare_picture
 from shared.imaging.views import Views
@@ -35,13 +37,15 @@ class TrackedPoses:
 @dataclass(frozen=True, eq=False)
 class ClipInputs:
     """A clip's views and surface; frames: its sampled frames on disk, place [F]: where among them each view is;
-    tracked: what its poses can be tracked from again, None where they were given."""
+    tracked: what its poses can be tracked from again, None where they were given; gaze [F, 2, 2] radians, None where it
+    is not known: that of the person, while views have what the mesh's eyeballs show."""
 
     views: Views
     surface: Surface
     frames: FrameSet
     place: np.ndarray
     tracked: TrackedPoses | None = None
+    gaze: np.ndarray | None = None
 
     @property
     def frame_index(self) -> np.ndarray:
@@ -80,7 +84,13 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
     poses = load_arrays(Path(pose_path)) if pose_path else tracked_poses
     points = None if mesh_path or pose_path else load_arrays(tracked / "tracks.npz")
     tracks = None if points is None else TrackPoints.tracked(points["points_head"], points["sigma_mm"])
-    camera_from_head, place, gaze = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
+    camera_from_head, place, kept = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
+    surface = Surface(mesh, segment, tuple(tracking["segments"]), tracks)
+    gaze = poses["gaze"][kept] if "gaze" in poses else None
+    shown, lids_px = None, None
+    if gaze is not None:
+        shown = _shown_gaze(surface, gaze, camera_from_head, tracking.get("eyes", {}))
+        lids_px = None if pose_path else _lids(load_arrays(tracked / "landmarks.npz"), kept)
     views = Views.in_one_light(
         camera_from_head=camera_from_head,
         lens=frames.intrinsics,
@@ -88,13 +98,13 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
         moves=frames.moves,
         read_picture=lambda f: read_picture(frames, int(place[f])),
         read_mask=lambda f: frames.read_mask(int(place[f])),
-        gaze=gaze,
+        gaze=shown,
+        lids_px=lids_px,
     )
-    surface = Surface(mesh, segment, tuple(tracking["segments"]), tracks)
     if tracks is None or tracking["held"]:
-        return ClipInputs(views, surface, frames, place)
+        return ClipInputs(views, surface, frames, place, gaze=gaze)
     again = TrackedPoses(lambda: look_again(frames, place), tracked_poses["covariance"])
-    return ClipInputs(views, surface, frames, place, again)
+    return ClipInputs(views, surface, frames, place, again, gaze)
 
 
 def look_again(frames: FrameSet, place: np.ndarray) -> TrackedClip:
@@ -124,9 +134,28 @@ def read_mean_texture(folder: Path, mesh: Mesh) -> ClipTexture:
     return ClipTexture(mesh, read_exr(folder / "mean_texture.exr"), read_exr(folder / "weight.exr"))
 
 
-def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Poses of sampled frames [F, 4, 4], their place in the frame set [F], and their gaze [F, 2, 2], None: not known.
+def _shown_gaze(surface: Surface, gaze: np.ndarray, camera_from_head: np.ndarray, said: dict) -> np.ndarray | None:
+    """Gaze [F, 2, 2] with which the mesh's eyeballs show the irises where the frames do; None where it has none.
+
+    said: of the eyes in tracking.json, where the irises turn about centres of their own; without it, about the mesh's.
     """
+    balls = eyeballs_of(surface)
+    if balls is None or "centres_mm" not in said:
+        return None if balls is None else gaze
+    cameras = camera_centres(camera_from_head)
+    irises = np.array(said["centres_mm"]) + said["iris_distance_mm"] * gaze_direction(gaze)
+    return np.stack([gaze_shown(ball, irises[:, k], cameras) for k, ball in enumerate(balls)], axis=1)
+
+
+def _lids(landmarks: dict, kept: list[int]) -> np.ndarray | None:
+    """Polygons [F, 2, 16, 2] px of the eyes' openings: the lower lid from the outer to the inner corner, then the upper
+    one back."""
+    order = [*range(9), *range(15, 8, -1)]
+    return landmarks["lids_px"][kept][:, :, order] if "lids_px" in landmarks else None
+
+
+def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Poses of sampled frames [F, 4, 4], their place in the frame set [F], and which of the poses they are."""
     if "camera_from_head" not in poses:
         raise InputError("no camera_from_head", where=where, got=", ".join(sorted(poses)))
     pose = poses["camera_from_head"].astype(np.float64)
@@ -135,5 +164,4 @@ def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.nd
     kept = [i for i, frame in enumerate(index) if int(frame) in place]
     if len(kept) < 3:
         raise InputError("too few poses belong to sampled frames", where=where, got=len(kept), expected="3 or more")
-    gaze = poses["gaze"][kept] if "gaze" in poses else None
-    return pose[kept], np.array([place[int(index[i])] for i in kept]), gaze
+    return pose[kept], np.array([place[int(index[i])] for i in kept]), kept

@@ -96,15 +96,20 @@ def join_views(parts: Sequence[Views]) -> Views:
         fitted=np.concatenate([part.fitted for part in parts]),
         read_picture=lambda f: parts[owner[f]].picture(f - first[owner[f]]),
         read_mask=lambda f: parts[owner[f]].mask(f - first[owner[f]]),
-        gaze=_gaze_of_all(parts),
+        gaze=_of_eyes([part.gaze for part in parts], counts),
+        lids_px=_of_eyes([part.lids_px for part in parts], counts),
     )
 
 
-def _gaze_of_all(parts: Sequence[Views]) -> np.ndarray | None:
-    """[F, 2, 2]; views whose gaze is not known say as little of the eyes as shut ones; None where none is known."""
-    if all(part.gaze is None for part in parts):
+def _of_eyes(parts: Sequence[np.ndarray | None], counts: Sequence[int]) -> np.ndarray | None:
+    """What is known of the eyes in each clip's views [F, 2, ...], in a row; NaN where it is not, as of shut eyes; None
+    where it is in no clip."""
+    known = [part for part in parts if part is not None]
+    if not known:
         return None
-    return np.concatenate([np.full((len(part), 2, 2), np.nan) if part.gaze is None else part.gaze for part in parts])
+    shape = known[0].shape[1:]
+    return np.concatenate([np.full((count, *shape), np.nan) if part is None else part
+                           for part, count in zip(parts, counts, strict=True)])
 
 
 def fit_similarity(

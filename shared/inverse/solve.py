@@ -23,7 +23,7 @@ from shared.geometry.mesh import uniform_laplacian
 from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import TexelSurface
-from shared.imaging.turning_eyes import EyeTexels, TurningEyes
+from shared.imaging.turning_eyes import LIDS, EyeTexels, TurningEyes
 from shared.imaging.views import Views
 from shared.inverse.clip_inputs import TrackedPoses
 from shared.inverse.lamp_distance import describe_lamp, find_lamp
@@ -109,7 +109,7 @@ def solve_clip(
     shading = shade_vertices(views, viewer, precomputed, settings.appearance, solution, context)
     texels = TexelSurface(surface.mesh, settings.map_size)
     eyes = None if views.gaze is None else TurningEyes.of(surface)
-    eye_texels = None if eyes is None else EyeTexels(texels, viewer, eyes)
+    eye_texels = None if eyes is None else EyeTexels(texels, viewer, eyes, surface.faces_of(LIDS))
     typical = np.median(solution.state.albedo, axis=0)
     texture = TexturePass(
         texels, viewer, shading, views, specular=specular_at(texels, solution), typical_albedo=typical,

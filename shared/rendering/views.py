@@ -45,8 +45,8 @@ HELD_OUT_SHOWN = 4
 
 @dataclass(frozen=True)
 class ViewCamera:
-    """camera_from_head [4, 4] mm, intrinsics [3, 3] px of a picture of size (width, height); gaze [2, 2] radians of the
-    head that it looks at, None: straight ahead."""
+    """camera_from_head [4, 4] mm, intrinsics [3, 3] px of a picture of size (width, height); gaze [2, 2] radians: how
+    the eyeballs are turned in the head that it looks at, None: straight ahead."""
 
     camera_from_head: np.ndarray
     intrinsics: np.ndarray
@@ -118,7 +118,7 @@ def held_out_cameras(
 def clip_camera(poses: Mapping[str, np.ndarray], f: int, lens: np.ndarray, size: tuple[int, int]) -> ViewCamera:
     """Camera f of a poses.npz with a lens [3, 3] and a picture's size (width, height), px, and the gaze if it has one.
     """
-    return ViewCamera(poses["camera_from_head"][f], lens, size, poses["gaze"][f] if "gaze" in poses else None)
+    return ViewCamera(poses["camera_from_head"][f], lens, size, poses["eye_turn"][f] if "eye_turn" in poses else None)
 
 
 def frontal_frame(camera_from_head: np.ndarray) -> int:

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from shapes import sphere
 
-from shared.geometry.eyeballs import eyeballs_of, fit_sphere, gaze_direction, gaze_rotation, gaze_towards
+from shared.geometry.eyeballs import (
+    eyeballs_of,
+    fit_sphere,
+    gaze_direction,
+    gaze_rotation,
+    gaze_shown,
+    gaze_towards,
+)
 from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface
 
@@ -61,3 +68,18 @@ def test_the_rotation_of_a_gaze_turns_the_eye_to_it():
     front = right.centre + [0.0, 0.0, right.radius]
     turned = right.turned(front[None], rotation[0])[0]
     np.testing.assert_allclose(turned, right.centre + right.radius * gaze_direction(GAZES[0]), atol=1e-9)
+
+
+def test_an_iris_beside_the_mesh_s_eyeball_is_shown_on_the_line_of_sight():
+    right, _ = eyeballs_of(two_balls())
+    cameras = right.centre + 500.0 * gaze_direction(RNG.uniform(-0.4, 0.4, (20, 2)))
+    on_ball = right.centre + right.radius * gaze_direction(GAZES)
+    np.testing.assert_allclose(gaze_shown(right, on_ball, cameras), GAZES, atol=1e-9)
+    beside = on_ball + RNG.uniform(-2.0, 2.0, (20, 3))
+    shown = right.centre + right.radius * gaze_direction(gaze_shown(right, beside, cameras))
+    off = np.cross(shown - cameras, beside - cameras)
+    np.testing.assert_allclose(off / 500.0**2, 0.0, atol=1e-9)
+    assert np.isnan(gaze_shown(right, np.full((1, 3), np.nan), cameras[:1])).all()
+    past = right.centre + [[3.0 * right.radius, 0.0, 0.0]]
+    limb = gaze_shown(right, past, right.centre + [[0.0, 0.0, 500.0]])
+    assert limb[0, 0] == pytest.approx(np.pi / 2, abs=0.1)
