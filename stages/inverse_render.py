@@ -206,7 +206,7 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
     from shared.imaging.frame_index import spread_frames
     from shared.io.arrays import save_arrays
     from shared.io.images import write_exr
-    from shared.rendering.render import SurfaceMaps, render_frame
+    from shared.rendering.render import LookingEyes, SurfaceMaps, render_frame
 
     (folder / "renders").mkdir(parents=True)
     write_light(folder, light, result)
@@ -228,9 +228,9 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
     maps = SurfaceMaps(result.maps["diffuse_albedo"], result.maps["specular_intensity"])
     chosen = spread_frames(len(index), job.params.render_count)
     for f in job.progress(chosen, "re-rendering"):
-        read_at = result.eyes.reader(turn[f]) if turning else None
+        eyes = LookingEyes(result.eyes, turn[f]) if turning else None
         image, _ = render_frame(result.viewer, result.shading, maps, first + f, poses[f], clip.lens, clip.views.size,
-                                read_at=read_at)
+                                eyes=eyes)
         write_exr(folder / "renders" / f"{index[f]:06d}.exr", image, colour_space="lin_rec709_scene")
     held_out = index[~result.views.fitted[first : first + len(index)]]
     return {"render_frames": index[chosen].tolist(), "held_out_frames": held_out.tolist()}

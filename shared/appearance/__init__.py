@@ -2,6 +2,6 @@
 
 Read in this order: albedo_scale, chart_scale, observations, light, light_models, sample_errors, skin_prior, products,
 transport, problem, projection, preconditioner, light_step, texture, light_weights, local_roughness, fit, diagnostics,
-texture_pass, fine_normals, maps.
+eye_albedo, texture_pass, fine_normals, maps.
 May import: compute, geometry, imaging, capture, rendering.
 """

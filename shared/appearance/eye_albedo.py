@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-IRIS_MM, LIMBUS_MM = 5.85, 1.0
-"""Radius of the visible iris in adults, and how far beyond it the white begins to be white."""
+from shared.geometry.eyeballs import IRIS_MM
+
+LIMBUS_MM = 1.0
+"""How far beyond the iris the white begins to be white."""
 BIN = 0.03
 """Radians of angle that share a value: a third of a millimetre or more of an eye."""
 RING_STEP, WHITE_STEP = 0.3, 0.03

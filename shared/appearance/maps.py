@@ -7,19 +7,28 @@ import numpy as np
 from shared.appearance.fine_normals import normal_image
 from shared.appearance.texture import PRIOR_SPREAD, TexelMaterial
 from shared.imaging.texels import TexelSurface
+from shared.rendering.eye_shine import EYE_ROUGHNESS
 
 
 def make_maps(
-    surface: TexelSurface, material: TexelMaterial, roughness: float | np.ndarray, turn: np.ndarray | None = None
+    surface: TexelSurface,
+    material: TexelMaterial,
+    roughness: float | np.ndarray,
+    turn: np.ndarray | None = None,
+    eyes: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
     """UV-space images with filled gutters; roughness: one, or each vertex's [V]; turn [T, 2]: of the normals, None:
-    they are the mesh's; confidence is the share of the prior's variance that the clip removed."""
+    they are the mesh's; eyes [E]: texels of the eyeballs, which are as smooth as tears, None: none are; confidence is
+    the share of the prior's variance that the clip removed."""
     confidence = PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + 1.0 / np.maximum(material.information, 1e-9))
     at_vertices = np.broadcast_to(np.asarray(roughness), len(surface.mesh.vertices))[:, None]
+    rough = surface.interpolate(at_vertices)[:, 0]
+    if eyes is not None:
+        rough[eyes] = EYE_ROUGHNESS
     return {
         "diffuse_albedo": surface.dilated(surface.to_image(material.albedo.astype(np.float32))),
         "specular_intensity": surface.dilated(surface.to_image(material.specular.astype(np.float32))),
-        "roughness": surface.dilated(surface.to_image(surface.interpolate(at_vertices)[:, 0])),
+        "roughness": surface.dilated(surface.to_image(rough)),
         "normal": normal_image(surface, turn),
         "confidence": surface.to_image(confidence.astype(np.float32)),
     }

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from shared.appearance.eye_albedo import IRIS_MM, round_albedo
+from shared.appearance.eye_albedo import round_albedo
 from shared.appearance.texture import (
     ERROR_OVER_SCATTER,
     IRRADIANCE_ERROR,
@@ -30,11 +30,14 @@ from shared.appearance.texture import (
 from shared.compute.read_ahead import work_ahead
 from shared.compute.run_context import SILENT, RunContext
 from shared.compute.threads import share_out
+from shared.geometry.eyeballs import IRIS_MM
+from shared.geometry.transforms import camera_centres
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer, is_inactive
 from shared.imaging.texels import FrameView, SmoothFields, TexelSamples, TexelSurface
 from shared.imaging.turning_eyes import EyeTexels
 from shared.imaging.views import Views
+from shared.rendering.eye_shine import EYE_INTENSITY, EyeShine
 from shared.rendering.shading import VertexShading
 
 Result = TypeVar("Result")
@@ -47,6 +50,8 @@ CONTRADICTED, LEAST_GAIN = ("as the skin around", "as their mean"), 0.98
 what they send out. Under a hard lamp the model is wrong there in all frames alike, and the skin around is the better
 guess; where poses are off, skin moves, or a beard is black, their mean is. Held-out frames share the lamp's errors, and
 fit the mean a little better there, too (0.7 %): they have to say so by a fiftieth."""
+REFLECTION = slice(7, 10)
+"""Columns of S in the table of a frame's view."""
 FIRST_PASS_FRAMES = 32
 """Enough to tell what a texel looks like, so that every frame's samples can be weighed by it."""
 
@@ -102,6 +107,8 @@ class TexturePass:
             self._systematic(own) / weight for own, weight in zip(lights, self.light_weights, strict=True)
         ]
         self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), context.progress
+        if eyes is not None:
+            self.specular = self._with_eyes(np.full(len(surface), specular, np.float32))
         self.region = region
         self.bare = 1.0 if bare is None else surface.interpolate(bare[:, None].astype(np.float32))
 
@@ -125,6 +132,8 @@ class TexturePass:
             pooled_specular(self.surface, evidence.equations, width, mean=self.specular, sigma=self.sigma)
             for width in widths
         ]
+        if self.eyes is not None:
+            pooled = [self._with_eyes(intensity) for intensity in pooled]
         candidates = self._close(evidence, pooled, fields)
         del evidence, fields  # a hundred bytes per texel that the frames to come need
         errors = np.reshape(self.held_out_errors(candidates), (len(CONTRADICTED), len(widths)))
@@ -167,7 +176,11 @@ class TexturePass:
         frame = self.surface.frame_view(view, picture, lens, values)
         if self.eyes is None:
             return frame
-        return self.eyes.turned(frame, view, views.gaze[f], None if views.lids_px is None else views.lids_px[f])
+        frame = self.eyes.turned(frame, view, views.gaze[f], None if views.lids_px is None else views.lids_px[f])
+        moved, camera = frame.moved, camera_centres(pose[None])[0]
+        shine = EyeShine(self.viewer, shading, self.eyes.eyes)
+        moved.values[:, REFLECTION] = shine.reflection(f, views.gaze[f], camera, moved.face, moved.bary)
+        return frame
 
     def _share_out(self, view: FrameView, work: Callable[[LitSamples], Result]) -> list[Result]:
         """work(samples) for each block of the frame's texels, on several threads -> the results in order."""
@@ -226,6 +239,12 @@ class TexturePass:
                 albedo = np.minimum(albedo, brightest).astype(np.float32)
                 found.append(TexelMaterial(albedo, specular, information.min(1)))
         return found
+
+    def _with_eyes(self, intensity: np.ndarray) -> np.ndarray:
+        """Specular intensity [T] with the eyeballs' own."""
+        intensity = intensity.copy()
+        intensity[self.eyes.rows] = EYE_INTENSITY
+        return intensity
 
     def _round_eyes(self, rough: np.ndarray, information: np.ndarray) -> np.ndarray:
         """[E, 3] albedo of the eyeballs' texels as those at the same angle have it, of a result [T, 3]."""

@@ -15,6 +15,9 @@ from shared.geometry.surface import Surface
 SIDES = ("right", "left")
 """Of the head itself; the right eye is on the side of -x. Whatever holds both eyes has them in this order."""
 
+IRIS_MM = 5.85
+"""Radius of the visible iris in adults."""
+
 
 @dataclass(frozen=True, eq=False)
 class Eyeball:

@@ -32,19 +32,28 @@ class TexelSamples:
 
 
 @dataclass(frozen=True)
+class MovedTexels:
+    """Texels rows [k], growing, that a frame shows at other places than their own: on faces face [k] with corner
+    weights bary [k, 3], and what a FrameView's table is there, values [k, 4 + C]."""
+
+    rows: np.ndarray
+    face: np.ndarray
+    bary: np.ndarray
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
 class FrameView:
     """A frame before it is sampled: rows [n] of the texels that it shows, table [V, 4 + C] of what is linear on the
     surface (pixel times depth, depth, weight, C values of the caller's), the picture and its saturation bounds as
-    float32; moved [k], growing: rows that lie elsewhere on the surface than in the map, with the table's values there,
-    moved_values [k, 4 + C]; None: none do."""
+    float32; moved: texels that lie elsewhere on the surface than in the map; None: none do."""
 
     rows: np.ndarray
     table: np.ndarray
     picture: Picture
     saturation: np.ndarray
     focal_length: np.float32
-    moved: np.ndarray | None = None
-    moved_values: np.ndarray | None = None
+    moved: MovedTexels | None = None
 
     def blocks(self) -> list[np.ndarray]:
         """The rows, cut where what a block needs no longer fits the processor's cache."""
@@ -120,8 +129,8 @@ class TexelSurface:
         rows = frame.rows if rows is None else rows
         found = self.interpolate(frame.table, rows)
         if frame.moved is not None:
-            _, here, there = np.intersect1d(rows, frame.moved, assume_unique=True, return_indices=True)
-            found[here] = frame.moved_values[there]
+            _, here, there = np.intersect1d(rows, frame.moved.rows, assume_unique=True, return_indices=True)
+            found[here] = frame.moved.values[there]
         pixels, footprint = np.empty((len(rows), 2), np.float32), np.empty(len(rows), np.float32)
         _project(found, self._texel_mm, rows, frame.focal_length, pixels, footprint)
         weight = found[:, 3] * sample_inside(frame.picture, pixels)

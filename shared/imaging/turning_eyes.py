@@ -9,7 +9,6 @@ place on them all the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,10 +18,8 @@ from shared.geometry.mesh import Mesh, interpolate, normalised, tangent_frames
 from shared.geometry.raycast import RAY_START_MM, RayScene
 from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer, View
-from shared.imaging.texels import FrameView, TexelSurface
+from shared.imaging.texels import FrameView, MovedTexels, TexelSurface
 
-ReadAt = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Faces [N] that rays meet (-1: none) and corner weights [N, 3] -> where on the surface their texture is read."""
 LID_MARGIN_MM = 1.0
 """What of an eyeball is so close to what covers it counts less or not: lids are off by that, and have lashes."""
 LIDS = ("lids", "eye_sockets")
@@ -59,10 +56,6 @@ class TurningEyes:
             at = self.mesh.faces[ball.faces] == ball.vertices[corner.argmax(1)][:, None, None]
             face[missed], bary[missed] = at.any(2).argmax(1), at[np.arange(len(missed)), at.any(2).argmax(1)]
         return ball.faces[face], bary
-
-    def reader(self, gaze: np.ndarray | None) -> ReadAt | None:
-        """read_at of one gaze [2, 2]; None: the eyes look straight ahead."""
-        return None if gaze is None else lambda face, bary: self.read_at(face, bary, gaze)
 
     def read_at(self, face: np.ndarray, bary: np.ndarray, gaze: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where rays that meet faces [n] (-1: none) with corner weights [n, 3] read the texture -> the same for it.
@@ -106,17 +99,17 @@ class EyeTexels:
             known &= np.isfinite(lids_px).all((1, 2))
         parts = [self._of_eye(side, frame, view, gaze[side], None if lids_px is None else lids_px[side])
                  for side in np.nonzero(known)[0]]
-        rows = np.concatenate([np.empty(0, int), *(part[0] for part in parts)])
-        values = np.concatenate([np.empty((0, frame.table.shape[1]), np.float32), *(part[1] for part in parts)])
-        order = np.argsort(rows)
+        nothing = np.empty(0, int), np.empty(0, int), np.empty((0, 3)), np.empty((0, frame.table.shape[1]), np.float32)
+        moved = [np.concatenate(columns) for columns in zip(nothing, *parts, strict=True)]
+        order = np.argsort(moved[0])
         still = np.setdiff1d(frame.rows, self.rows, assume_unique=True)
-        return replace(frame, rows=np.sort(np.concatenate([still, rows])), moved=rows[order],
-                       moved_values=values[order])
+        return replace(frame, rows=np.sort(np.concatenate([still, moved[0]])),
+                       moved=MovedTexels(*(column[order] for column in moved)))
 
     def _of_eye(
         self, side: int, frame: FrameView, view: View, gaze: np.ndarray, lids_px: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The rows [n] of one eye that the frame shows, and the table's values [n, 4 + C] at their places."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The fields of MovedTexels for what the frame shows of one eye."""
         viewer, faces, size = self.viewer, self.surface.mesh.faces, frame.picture.inside.shape[::-1]
         rows = self.rows[self.side == side]
         face, bary = self.eyes.place(side, self.directions[self.side == side] @ gaze_rotation(gaze).T)
@@ -138,7 +131,7 @@ class EyeTexels:
         else:
             covered = self._but_lids.occluded(places, towards)
         shown = shown[~covered]
-        return rows[shown], values[shown].astype(np.float32)
+        return rows[shown], face[~covered], bary[~covered], values[shown].astype(np.float32)
 
     def _covered(self, places: np.ndarray, normals: np.ndarray, towards: np.ndarray) -> np.ndarray:
         """[n] bool: does something lie between the camera and a place, or what is within the margin about it."""

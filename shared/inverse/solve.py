@@ -140,7 +140,7 @@ def solve_clip(
         "albedo_scale": describe_scale(chart, typical),
         "model_selection": selected.candidates,
     }
-    maps = make_maps(texels, material, roughness, turn)
+    maps = make_maps(texels, material, roughness, turn, None if eye_texels is None else eye_texels.rows)
     return InverseResult(solution, material, maps, shading, viewer, views, record, covariance, eyes)
 
 

@@ -15,8 +15,10 @@ import numpy as np
 from shared.compute.compiled import compiled
 from shared.compute.threads import share_out
 from shared.geometry.raycast import camera_hits
+from shared.geometry.transforms import camera_centres
 from shared.imaging.image_sampling import SurfaceViewer
-from shared.imaging.turning_eyes import ReadAt
+from shared.imaging.turning_eyes import TurningEyes
+from shared.rendering.eye_shine import EyeShine
 from shared.rendering.shading import VertexShading
 
 _ROWS_PER_BAND = 32
@@ -30,6 +32,26 @@ class SurfaceMaps:
     specular_intensity: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class LookingEyes:
+    """Eyes with their gaze [2, 2] radians; NaN: straight ahead."""
+
+    eyes: TurningEyes
+    gaze: np.ndarray
+
+    def shine(
+        self, viewer: SurfaceViewer, shading: VertexShading, frame: int, camera: np.ndarray, face: np.ndarray,
+        bary: np.ndarray,
+    ) -> np.ndarray:
+        """S [N, 3] float32 of rays that meet faces [N] (-1: none) with corner weights [N, 3]; -1 where that is no eye.
+        frame: the shading's; camera [3]: its centre in head space, mm."""
+        own = np.full((len(face), 3), -1.0, np.float32)
+        at = np.nonzero((face >= 0) & (self.eyes.side[face] >= 0))[0]
+        if len(at):
+            own[at] = EyeShine(viewer, shading, self.eyes).reflection(frame, self.gaze, camera, face[at], bary[at])
+        return own
+
+
 def render_frame(
     viewer: SurfaceViewer,
     shading: VertexShading,
@@ -39,16 +61,16 @@ def render_frame(
     intrinsics: np.ndarray,
     size: tuple[int, int],
     samples: int = 2,
-    read_at: ReadAt | None = None,
+    eyes: LookingEyes | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Linear radiance [H, W, 3] and coverage [H, W] in [0, 1] of one frame; 0 outside the head.
 
-    size: (width, height); samples: rays per pixel along each axis. frame: the shading's frame; read_at: where the
-    texture lies elsewhere than in the map, as an eye's does that turns; None: nowhere. Radiance is the mean over the
-    rays that hit the head, so that partly covered pixels are not darkened.
+    size: (width, height); samples: rays per pixel along each axis. frame: the shading's frame; eyes: those of
+    the head, None: its eyeballs are parts of the skin. Radiance is the mean over the rays that hit the head, so that
+    partly covered pixels are not darkened.
     """
     (radiance,), coverage = render_lights(
-        viewer, shading, maps, [frame], camera_from_head, intrinsics, size, samples=samples, read_at=read_at
+        viewer, shading, maps, [frame], camera_from_head, intrinsics, size, samples=samples, eyes=eyes
     )
     return radiance, coverage
 
@@ -62,7 +84,7 @@ def render_lights(
     intrinsics: np.ndarray,
     size: tuple[int, int],
     samples: int = 2,
-    read_at: ReadAt | None = None,
+    eyes: LookingEyes | None = None,
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """As render_frame of several of the shading's frames in which the camera stands alike and the light may not: a
     ray is traced once for all of them. -> radiance [H, W, 3] of each, and their coverage [H, W]."""
@@ -76,6 +98,8 @@ def render_lights(
     intensity = np.ascontiguousarray(maps.specular_intensity, np.float32)
     radiance, hits = np.zeros((len(shades), height * width, 3), np.float32), np.zeros(height * width, np.float32)
 
+    camera, no_shine = camera_centres(camera_from_head[None])[0], np.empty((0, 3), np.float32)
+
     def render(band: int) -> None:
         first = band * _ROWS_PER_BAND
         rows = min(_ROWS_PER_BAND, height - first)
@@ -87,9 +111,12 @@ def render_lights(
                 face, bary, _ = camera_hits(viewer.scene, camera_from_head, lens, width, rows, offsets)
                 face, bary = face.ravel(), bary.reshape(-1, 3)
                 hits[pixels] += face >= 0
-                read = (face, bary) if read_at is None else read_at(face, bary)
-                for shade, sent in zip(shades, radiance[:, pixels], strict=True):
-                    _add_radiance(face, bary, *read, mesh.faces, mesh.face_uvs, uvs, albedo, intensity, shade, sent)
+                read = (face, bary) if eyes is None else eyes.eyes.read_at(face, bary, eyes.gaze)
+                for frame, shade, sent in zip(frames, shades, radiance[:, pixels], strict=True):
+                    shine = no_shine if eyes is None else eyes.shine(viewer, shading, frame, camera, face, bary)
+                    _add_radiance(
+                        face, bary, *read, shine, mesh.faces, mesh.face_uvs, uvs, albedo, intensity, shade, sent
+                    )
 
     share_out(-(-height // _ROWS_PER_BAND), render)
     radiance /= np.maximum(hits, 1.0)[:, None]
@@ -98,10 +125,11 @@ def render_lights(
 
 @compiled
 def _add_radiance(
-    face, bary, texture_face, texture_bary, faces, face_uvs, uvs, albedo, specular_intensity, shade, radiance
+    face, bary, texture_face, texture_bary, shine, faces, face_uvs, uvs, albedo, specular_intensity, shade, radiance
 ):
     """Adds to radiance [N, 3] what rays see: face [N] (-1: nothing), bary [N, 3], and where the texture is read;
-    shade [V, 6]: E and S; maps as by texture.sample_bilinear."""
+    shade [V, 6]: E and S; shine [N, 3]: S of the rays themselves where it is not negative, [0, 3]: nowhere; maps as by
+    texture.sample_bilinear."""
     one, half, size = np.float32(1.0), np.float32(0.5), len(albedo)
     for n in range(len(face)):
         if face[n] < 0:
@@ -124,4 +152,6 @@ def _add_radiance(
             for k in range(3):
                 irradiance += bary[n, k] * shade[faces[face[n], k], c]
                 reflection += bary[n, k] * shade[faces[face[n], k], c + 3]
+            if len(shine) > 0 and shine[n, c] >= 0.0:
+                reflection = shine[n, c]
             radiance[n, c] += diffuse * irradiance + specular * reflection

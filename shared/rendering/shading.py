@@ -129,6 +129,7 @@ class VertexShading:
     def _light(self, light, camera_from_head, moves, light_index, lamp=None) -> None:
         turns = world_from_head(camera_from_head, moves)
         self.light_along = self.far_along = light_along(light, self.directions, turns, light_index)
+        self._cube, self._turns, self._light_index = light, turns, light_index
         self._lamp = None
         if lamp is not None:
             self._lamp = LampShine.of(light, SeenLamp.of(lamp, camera_from_head, moves), self.directions)
@@ -171,6 +172,15 @@ class VertexShading:
         if self._lamp is not None:
             direct += self._lamp.irradiance(self._node_points, self._nodes.visibility())
         return node_radiosity(self._nodes, self.material.bounce_albedo(), direct).reshape(len(direct), -1)
+
+    def arriving(self, frame: int, directions: np.ndarray) -> np.ndarray:
+        """[n, 3]: the light of a frame along unit directions [n, 3] in head space, as the head's mean place sees it,
+        whatever covers it."""
+        own = None if self._light_index is None else self._light_index[frame : frame + 1]
+        texels = len(self._cube) if own is None else len(self._cube) // (int(self._light_index.max()) + 1)
+        first = 0 if own is None else int(own[0]) * texels
+        lookup = frame_lookup(directions, self._turns[frame : frame + 1], round((texels / 6) ** 0.5))
+        return lookup @ np.asarray(self._cube[first : first + texels], np.float64)
 
     @cached_property
     def stand_in(self) -> np.ndarray:

@@ -19,11 +19,11 @@ from shared.geometry.transforms import camera_centres, rigid, world_from_head
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texture import sample_bilinear
-from shared.imaging.turning_eyes import ReadAt, TurningEyes
+from shared.imaging.turning_eyes import TurningEyes
 from shared.rendering.envmap import cube_from_latlong, latlong_directions, latlong_lookup
 from shared.rendering.near_lamp import NearLamp
 from shared.rendering.precomputed_transfer import Sizes, precompute_transfer
-from shared.rendering.render import SurfaceMaps, render_frame, render_lights
+from shared.rendering.render import LookingEyes, SurfaceMaps, render_frame, render_lights
 from shared.rendering.shading import DEEP, Material, VertexShading
 from shared.rendering.split_sum import SplitSum
 from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
@@ -215,7 +215,7 @@ class HeadViews:
         shading = self._shading(lights, [camera] * len(lights), "camera")
         pictures, covered = render_lights(
             self.viewer, shading, self.maps, range(len(lights)), camera.camera_from_head, camera.intrinsics,
-            camera.size, read_at=self._read_at(camera),
+            camera.size, eyes=self._looking(camera),
         )
         return [picture * covered[..., None] for picture in pictures]
 
@@ -225,13 +225,14 @@ class HeadViews:
         for k, camera in enumerate(cameras):
             picture, covered = render_frame(
                 self.viewer, shading, self.maps, k, camera.camera_from_head, camera.intrinsics, camera.size,
-                read_at=self._read_at(camera),
+                eyes=self._looking(camera),
             )
             pictures.append(picture * covered[..., None] if fade else picture)
         return pictures
 
-    def _read_at(self, camera: ViewCamera) -> ReadAt | None:
-        return None if self.eyes is None else self.eyes.reader(camera.gaze)
+    def _looking(self, camera: ViewCamera) -> LookingEyes | None:
+        gaze = np.full((2, 2), np.nan) if camera.gaze is None else camera.gaze
+        return None if self.eyes is None else LookingEyes(self.eyes, gaze)
 
     def _shading(
         self, lights: Sequence[np.ndarray], cameras: Sequence[ViewCamera], moves: str, lamp: NearLamp | None = None

@@ -11,7 +11,7 @@ from shared.geometry.transforms import camera_centres, rigid
 from shared.imaging.image_sampling import SurfaceViewer, prepare_picture
 from shared.imaging.texels import TexelSurface
 from shared.imaging.turning_eyes import EyeTexels, TurningEyes, depth_in_polygon
-from shared.rendering.render import SurfaceMaps, render_frame
+from shared.rendering.render import LookingEyes, SurfaceMaps, render_frame
 
 SIZE, LENS = (200, 100), np.array([[900.0, 0, 100], [0, 900.0, 50], [0, 0, 1]])
 POSE = rigid(FACING, np.array([0.0, 0.0, 400.0]))
@@ -134,7 +134,7 @@ def test_lids_of_the_picture_bound_what_counts(eyes):
     slit = np.array([[-40.0, -6.0], [40.0, -6.0], [40.0, 6.0], [-40.0, 6.0]])
     middles = np.array([[100.0 - 900 * 25 / 400, 50.0], [100.0 + 900 * 25 / 400, 50.0]])
     turned = eye_texels.turned(still, view, GAZES[0], middles[:, None] + slit)
-    below = turned.moved_values[:, 1] / turned.moved_values[:, 2]
+    below = turned.moved.values[:, 1] / turned.moved.values[:, 2]
     assert len(below) > 50 and np.abs(below - 50.0).max() < 6.0
     unseen = eye_texels.turned(still, view, GAZES[0], np.full((2, 4, 2), np.nan))
     assert len(unseen.rows) == 0
@@ -149,6 +149,14 @@ class FlatShading:
     def reflection(self, frame):
         return np.zeros((2 * 2562, 3), np.float32)
 
+    def arriving(self, frame, directions):
+        return np.ones((len(directions), 3))
+
+    def blocked_light(self, frame):
+        return np.ones((1, 3))
+
+    stand_in = np.zeros(2 * 2562, int)
+
 
 def test_a_re_render_turns_the_texture(eyes):
     texels, viewer, eye_texels = eyes
@@ -156,8 +164,8 @@ def test_a_re_render_turns_the_texture(eyes):
     maps = SurfaceMaps(albedo, np.zeros((MAP, MAP), np.float32))
 
     def rendered(gaze):
-        reader = eye_texels.eyes.reader(gaze)
-        return render_frame(viewer, FlatShading(), maps, 0, POSE, LENS, SIZE, read_at=reader)
+        eyes = None if gaze is None else LookingEyes(eye_texels.eyes, gaze)
+        return render_frame(viewer, FlatShading(), maps, 0, POSE, LENS, SIZE, eyes=eyes)
 
     for gaze in GAZES[:3]:
         picture, covered = rendered(gaze)

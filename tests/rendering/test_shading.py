@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from quadrature import hemisphere_quadrature
-from shapes import FACING, nods, sphere
+from shapes import FACING, nods, sphere, turned
 
 from shared.geometry.mesh import normalised
 from shared.geometry.raycast import RayScene
@@ -206,3 +206,19 @@ def test_key_frames_are_near_each_other_in_turn():
     assert np.diff(turn[keys]).max() <= 0.05 + 1e-9
     assert len(keys) < 40
     assert np.array_equal(key_frames(turn[::20], 0.05), np.arange(6))
+
+
+def test_light_that_arrives_is_what_shading_sums_up():
+    light = np.random.default_rng(5).uniform(size=(2 * 6 * 4**2, 3))
+    mesh, directions = sphere(50.0, 2), fibonacci_sphere(64)
+    points = mesh_points(mesh)
+    nodes = bounce_nodes(mesh, 20)
+    transfer = trace_transfer(RayScene(mesh.vertices, mesh.faces), points, nodes, directions)
+    poses = turned([[0.0, 0.3, 0], [0.1, -0.2, 0], [0.2, 0.0, 0.1]], (0.0, 0.0, 500.0))
+    shading = VertexShading(
+        np.arange(len(points)), points.positions, points, transfer, transfer,
+        Material(np.full((len(nodes.points), 3), 0.5), 0.0, 0.5), light, directions, poses, "head", bounce=False,
+        light_index=np.array([0, 1, 1]),
+    )
+    for frame in range(3):
+        np.testing.assert_allclose(shading.arriving(frame, directions), shading.light_along[:, frame], rtol=1e-5)
