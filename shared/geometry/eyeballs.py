@@ -76,9 +76,10 @@ def gaze_towards(direction: np.ndarray) -> np.ndarray:
 
 def gaze_shown(ball: Eyeball, irises: np.ndarray, cameras: np.ndarray) -> np.ndarray:
     """Gaze [F, 2] with which a mesh's eyeball shows an iris where cameras see it: a fitted head's eyeball is some
-    millimetres off in centre and size, which an iris' place [F, 3] in head space, mm, need not follow.
+    millimetres off in centre and size, which an iris' place need not follow.
 
-    cameras [F, 3]: centres in head space. Where the line of sight passes by the eyeball: its point nearest to it.
+    irises [F, 3], cameras [F, 3]: places of both in head space, mm. Where the line of sight passes by the eyeball: its
+    point nearest to it.
     """
     sight = normalised(irises - cameras)
     away = ball.centre - cameras

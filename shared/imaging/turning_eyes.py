@@ -42,7 +42,8 @@ class TurningEyes:
         return None if balls is None else cls(surface.mesh, balls)
 
     def directions(self, side: int, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
-        """[n, 3] unit: from the centre of an eyeball to places on its faces [n] with corner weights [n, 3]."""
+        """[n, 3] unit: from the centre of an eyeball to places on its faces, face [n] int and corner weights bary
+        [n, 3]."""
         return normalised(interpolate(self.mesh.vertices, self.mesh.faces, face, bary) - self.balls[side].centre)
 
     def place(self, side: int, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -87,10 +87,8 @@ def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: st
     camera_from_head, place, kept = _match(frames, poses, pose_path or str(tracked / "poses.npz"))
     surface = Surface(mesh, segment, tuple(tracking["segments"]), tracks)
     gaze = poses["gaze"][kept] if "gaze" in poses else None
-    shown, lids_px = None, None
-    if gaze is not None:
-        shown = _shown_gaze(surface, gaze, camera_from_head, tracking.get("eyes", {}))
-        lids_px = None if pose_path else _lids(load_arrays(tracked / "landmarks.npz"), kept)
+    shown = None if gaze is None else _shown_gaze(surface, gaze, camera_from_head, tracking.get("eyes", {}))
+    lids_px = None if shown is None or pose_path else _lids(load_arrays(tracked / "landmarks.npz"), kept)
     views = Views.in_one_light(
         camera_from_head=camera_from_head,
         lens=frames.intrinsics,
@@ -135,13 +133,15 @@ def read_mean_texture(folder: Path, mesh: Mesh) -> ClipTexture:
 
 
 def _shown_gaze(surface: Surface, gaze: np.ndarray, camera_from_head: np.ndarray, said: dict) -> np.ndarray | None:
-    """Gaze [F, 2, 2] with which the mesh's eyeballs show the irises where the frames do; None where it has none.
+    """Gaze [F, 2, 2] with which the mesh's eyeballs show the irises where the frames do.
 
-    said: of the eyes in tracking.json, where the irises turn about centres of their own; without it, about the mesh's.
+    None where the mesh has none, or where all frames show shut eyes: then the lids are seen on its eyeballs. said: of the eyes in tracking.json, where the irises turn about centres of their own; without it, about the mesh's.
     """
     balls = eyeballs_of(surface)
-    if balls is None or "centres_mm" not in said:
-        return None if balls is None else gaze
+    if balls is None or not np.isfinite(gaze).any():
+        return None
+    if "centres_mm" not in said:
+        return gaze
     cameras = camera_centres(camera_from_head)
     irises = np.array(said["centres_mm"]) + said["iris_distance_mm"] * gaze_direction(gaze)
     return np.stack([gaze_shown(ball, irises[:, k], cameras) for k, ball in enumerate(balls)], axis=1)

@@ -33,7 +33,8 @@ class EyeShine:
     def reflection(
         self, frame: int, gaze: np.ndarray, camera: np.ndarray, face: np.ndarray, bary: np.ndarray
     ) -> np.ndarray:
-        """S [n, 3] float32 at specular_intensity 1 of places on the eyeballs, by faces [n] and corner weights [n, 3].
+        """S [n, 3] float32 at specular_intensity 1 of places on the eyeballs, on faces face [n] int with corner weights
+        bary [n, 3].
 
         gaze [2, 2] radians, NaN: straight ahead; camera [3]: its centre in head space, mm.
         """

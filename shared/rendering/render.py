@@ -43,8 +43,8 @@ class LookingEyes:
         self, viewer: SurfaceViewer, shading: VertexShading, frame: int, camera: np.ndarray, face: np.ndarray,
         bary: np.ndarray,
     ) -> np.ndarray:
-        """S [N, 3] float32 of rays that meet faces [N] (-1: none) with corner weights [N, 3]; -1 where that is no eye.
-        frame: the shading's; camera [3]: its centre in head space, mm."""
+        """S [N, 3] float32 of rays that meet face [N] int (-1: none) with corner weights bary [N, 3]; -1 where that is
+        no eye. frame: the shading's; camera [3]: its centre in head space, mm."""
         own = np.full((len(face), 3), -1.0, np.float32)
         at = np.nonzero((face >= 0) & (self.eyes.side[face] >= 0))[0]
         if len(at):
