@@ -112,27 +112,32 @@ class EyeTexels:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The fields of MovedTexels for what the frame shows of one eye."""
         viewer, faces, size = self.viewer, self.surface.mesh.faces, frame.picture.inside.shape[::-1]
-        rows = self.rows[self.side == side]
-        face, bary = self.eyes.place(side, self.directions[self.side == side] @ gaze_rotation(gaze).T)
-        values = interpolate(frame.table, faces, face, bary)
-        cosine = interpolate(view.cosine, faces, face, bary)
-        pixels = values[:, :2] / values[:, 2:3]
-        shown = (pixels > 1.0).all(1) & (pixels < np.subtract(size, 1.0)).all(1) & (values[:, 2] > 0.0)
-        values[:, 3] = np.where(shown & (cosine > viewer.least_cosine), np.square(cosine), 0.0)
+        own = self.side == side
+        rows, directions = self.rows[own], self.directions[own] @ gaze_rotation(gaze).T
+        facing = directions @ view.towards_camera[self.eyes.balls[side].vertices].mean(0) > 0.0
+        rows, (face, bary) = rows[facing], self.eyes.place(side, directions[facing])
+        across, down, depth = interpolate(frame.table[:, :3], faces, face, bary).T
+        pixels = np.stack([across, down], axis=1) / depth[:, None]
+        weight = ((pixels > 1.0) & (pixels < np.subtract(size, 1.0))).all(1) & (depth > 0.0)
         if lids_px is not None:
-            inside_mm = depth_in_polygon(pixels, lids_px) * values[:, 2] / frame.focal_length
-            values[:, 3] *= np.clip(inside_mm / LID_MARGIN_MM - 0.5, 0.0, 1.0)
-        shown = np.nonzero(values[:, 3] > 0.0)[0]
-        face, bary = face[shown], bary[shown]
+            weight = weight & (pixels > lids_px.min(0)).all(1) & (pixels < lids_px.max(0)).all(1)
+        rows, face, bary, pixels, depth = (values[weight] for values in (rows, face, bary, pixels, depth))
+        cosine = interpolate(view.cosine, faces, face, bary)
+        weight = np.where(cosine > viewer.least_cosine, np.square(cosine), 0.0)
+        if lids_px is not None:
+            inside_mm = depth_in_polygon(pixels, lids_px) * depth / frame.focal_length
+            weight *= np.clip(inside_mm / LID_MARGIN_MM - 0.5, 0.0, 1.0)
+        rows, face, bary, weight = (values[weight > 0.0] for values in (rows, face, bary, weight))
         normals = normalised(interpolate(viewer.normals, faces, face, bary))
         towards = normalised(interpolate(view.towards_camera, faces, face, bary))
         places = interpolate(self.surface.mesh.vertices, faces, face, bary) + RAY_START_MM * normals
         if lids_px is None:
-            covered = self._covered(places, normals, towards)
+            shown = ~self._covered(places, normals, towards)
         else:
-            covered = self._but_lids.occluded(places, towards)
-        shown = shown[~covered]
-        return rows[shown], face[~covered], bary[~covered], values[shown].astype(np.float32)
+            shown = ~self._but_lids.occluded(places, towards)
+        values = interpolate(frame.table, faces, face[shown], bary[shown])
+        values[:, 3] = weight[shown]
+        return rows[shown], face[shown], bary[shown], values
 
     def _covered(self, places: np.ndarray, normals: np.ndarray, towards: np.ndarray) -> np.ndarray:
         """[n] bool: does something lie between the camera and a place, or what is within the margin about it."""

@@ -135,7 +135,8 @@ def read_mean_texture(folder: Path, mesh: Mesh) -> ClipTexture:
 def _shown_gaze(surface: Surface, gaze: np.ndarray, camera_from_head: np.ndarray, said: dict) -> np.ndarray | None:
     """Gaze [F, 2, 2] with which the mesh's eyeballs show the irises where the frames do.
 
-    None where the mesh has none, or where all frames show shut eyes: then the lids are seen on its eyeballs. said: of the eyes in tracking.json, where the irises turn about centres of their own; without it, about the mesh's.
+    None where the mesh has none, or where all frames show shut eyes: then the lids are seen on its eyeballs.
+    said: of the eyes in tracking.json, where irises turn about centres of their own; without it, about the mesh's.
     """
     balls = eyeballs_of(surface)
     if balls is None or not np.isfinite(gaze).any():
