@@ -30,12 +30,13 @@ STAGE = Stage(
     outputs=(
         Output("head.usda", "light, camera and motion; loads the next three", unit="mm", space="world"),
         Output("head_payload.usda", "payload of head.usda: joins the next two"),
-        Output("head_geo.usdc", "the mesh", unit="mm", space="head"),
+        Output("head_geo.usdc", "the mesh; head and eyes where the gaze is known", unit="mm", space="head"),
         Output("head_mtl.usda", "the materials"),
         Output("head.usdz", "all of head.usda and its textures in one file; absent when usdz is off", optional=True),
         Output("head.glb", "mesh, textures, lens and motion as binary glTF; absent when glb is off", unit="m",
                optional=True),
-        Output("mesh.obj", "the mesh with its UVs", unit="mm", space="head"),
+        Output("mesh.obj", "the mesh with its UVs; groups for head and eyes where the gaze is known", unit="mm",
+               space="head"),
         Output("maps/*.exr", "texture maps, v up", space="uv", colour_space="in each file"),
         Output("maps/png/*.png", "integer copies of the maps; absent unless png_copies", space="uv", optional=True),
         Output("envmap.exr", "the light, lat-long", space="world", colour_space="in the file"),
@@ -43,7 +44,8 @@ STAGE = Stage(
                colour_space="in the file", optional=True),
         Output("envmap_far.exr", "the light without the main lamp, where that stands near", space="world",
                colour_space="in the file", optional=True),
-        Output("poses.npz", "the head's pose in each frame, and the lens", "mm", fields=EXPORTED_POSES),
+        Output("poses.npz", "the head's pose in each frame, the lens, and where the eyes look", "mm",
+               fields=EXPORTED_POSES),
         Output("plates/*.jpg", "the clip's crops, sRGB; absent when plates is off", space="crop", optional=True),
         Output("renders/*.exr", "re-renders in full source frames", colour_space="in each file"),
         Output("views/*.exr", "novel and relit views, and the lights of the latter; absent when views is off",
@@ -127,7 +129,7 @@ def describe_capture(job: Job, poses: dict, frames):
     return UsdCapture(poses["camera_from_head"], poses["frame_index"], fps=frames.fps, intrinsics=intrinsics,
                       width=width,
                       height=height, moves=frames.moves, film_width_mm=film_width,
-                      light_with_camera=light_moves(job, frames.moves) != frames.moves)
+                      light_with_camera=light_moves(job, frames.moves) != frames.moves, gaze=poses.get("gaze"))
 
 
 def near_lamp(solve: dict):
@@ -140,7 +142,7 @@ def near_lamp(solve: dict):
     return BallLamp(tuple(lamp["position_mm"]), lamp["radius_mm"], tuple(lamp["radiance"]))
 
 
-def describe_asset(job: Job, mesh, capture, frames, writer, lamp):
+def describe_asset(job: Job, mesh, eyes, capture, frames, writer, lamp):
     """The asset that head.usda and head.usdz hold; writes the plates. lamp: what stands near of the light, or None."""
     from shared.io.plates import crop_rectangle, write_plates
     from shared.io.usd import HeadAsset
@@ -162,8 +164,8 @@ def describe_asset(job: Job, mesh, capture, frames, writer, lamp):
         "confidence_map": f"maps/{writer.file_name('confidence')}",
     }
     light = TextureFile("./envmap.exr" if lamp is None else "./envmap_far.exr", writer.colour_space)
-    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, lamp, version=str(STAGE.version),
-                     metadata=metadata)
+    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, lamp, eyes,
+                     version=str(STAGE.version), metadata=metadata)
 
 
 def write_assets(job: Job, asset, poses: dict, maps: dict, envmap) -> None:
@@ -175,14 +177,14 @@ def write_assets(job: Job, asset, poses: dict, maps: dict, envmap) -> None:
     from shared.io.usd import write_head_usda
     from shared.io.usdz import write_head_usdz
 
-    write_obj(job.out / "mesh.obj", asset.mesh)
-    kept = {name: poses[name] for name in ("camera_from_head", "frame_index", "intrinsics")}
+    write_obj(job.out / "mesh.obj", asset.mesh, asset.eyes)
+    kept = {name: poses[name] for name in ("camera_from_head", "frame_index", "intrinsics", "gaze") if name in poses}
     save_arrays(job.out / "poses.npz", **kept)
     write_head_usda(job.out, asset)
     if job.params.usdz:
         write_head_usdz(job.out / "head.usdz", asset, maps, envmap)
     if job.params.glb:
-        write_glb(job.out / "head.glb", asset.name, asset.mesh, maps, asset.capture)
+        write_glb(job.out / "head.glb", asset.name, asset.mesh, maps, asset.capture, asset.eyes)
 
 
 def light_moves(job: Job, moves: str) -> str:
@@ -326,7 +328,8 @@ def run(job: Job) -> None:
     if lamp is not None:
         far = read_exr(solved / "envmap_far.exr")
         writer.write_colour(job.out / "envmap_far.exr", far, "radiance, clip maximum 1", latlong=True)
-    asset = describe_asset(job, mesh, describe_capture(job, poses, frames), frames, writer, lamp)
+    eyes = read_eyes(job, mesh, poses)
+    asset = describe_asset(job, mesh, eyes, describe_capture(job, poses, frames), frames, writer, lamp)
     write_assets(job, asset, poses, maps, far)
     eyes = read_eyes(job, mesh, poses)
     views = render_views(job, writer, mesh, eyes, maps, envmap, poses, frames, solve)

@@ -1,5 +1,5 @@
 """Rigid motions and cameras, triangle meshes and their checks, rays, the atlas of a mesh's UVs.
 
-Read in this order: transforms, mesh, surface, eyeballs, embree, raycast, atlas, intersections, mesh_checks.
+Read in this order: transforms, mesh, surface, eyeballs, parts, embree, raycast, atlas, intersections, mesh_checks.
 May import: compute.
 """

@@ -1,18 +1,21 @@
-"""The head as binary glTF: mesh, textures, lens and motion for web viewers and game engines.
+"""The head as binary glTF: mesh, textures, lens, motion and gaze for web viewers and game engines.
 
 glTF counts metres and seconds, its cameras look along -z with y up as USD's do, its v runs downwards. Roughness is
 the same (alpha = roughness^2), F0 is 0.04 without an index of refraction, and KHR_materials_specular scales it. What
 the format cannot say: a shifted principal point and an environment light; both are in head.usda.
 
+Eyeballs that are known are nodes of their own below the head's: their centre is the node's place, the gaze its
+rotation, and without the animation they look straight ahead.
+
 References: glTF 2.0 specification (GLB container, accessors, animations); KHR_materials_specular (F0 = min(0.04 *
-specularColor, 1) * specular).
+specularColor, 1) * specular); KHR_materials_ior.
 """
 
 from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -20,14 +23,23 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from shared.errors import LimnError
-from shared.geometry.mesh import Mesh, shading_normals, unique_pairs
+from shared.geometry.eyeballs import Eyeball
+from shared.geometry.mesh import Mesh, unique_pairs
+from shared.geometry.parts import HEAD, RigidPart, head_parts
 from shared.io.export_maps import integer_codes
-from shared.io.usd_capture import UsdCapture, world_from_head_rigid, world_from_usd_camera
+from shared.io.usd_capture import UsdCapture, eye_turns, world_from_head_rigid, world_from_usd_camera
+from shared.io.usd_material import EYE_IOR, EYE_ROUGHNESS
 
 METRES_PER_MM = 0.001
 _FLOAT, _UINT = 5126, 5125
 _ARRAY, _INDEX = 34962, 34963
 _LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
+_FIRST_EYE = 2
+_EYE_MATERIAL = {
+    "name": "eye",
+    "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": EYE_ROUGHNESS},
+    "extensions": {"KHR_materials_ior": {"ior": EYE_IOR}},
+}
 _KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
@@ -62,19 +74,34 @@ class _Buffer:
         return len(self.accessors) - 1
 
 
-def write_glb(path: Path | str, name: str, mesh: Mesh, maps: Mapping[str, np.ndarray], capture: UsdCapture) -> None:
-    """One file with all inside. maps: diffuse_albedo, specular_intensity, roughness and normal, as exported."""
+def write_glb(
+    path: Path | str,
+    name: str,
+    mesh: Mesh,
+    maps: Mapping[str, np.ndarray],
+    capture: UsdCapture,
+    eyes: Sequence[Eyeball] = (),
+) -> None:
+    """One file with all inside. maps: diffuse_albedo, specular_intensity, roughness and normal, as exported; eyes: the
+    right and the left eyeball of the mesh, to be nodes of their own, or none."""
     buffer = _Buffer()
-    textures, material = _material(buffer, maps)
+    textures, skin = _material(buffer, maps)
     width, height = capture.width, capture.height
+    head, *turning = head_parts(mesh, eyes)
+    nodes = [{"name": HEAD, "mesh": 0}, {"name": "camera", "camera": 0}]
+    if turning:
+        nodes[0]["children"] = [_FIRST_EYE + k for k in range(len(turning))]
+        nodes += [{"name": eye.name, "mesh": 1 + k, "translation": (eye.pivot * METRES_PER_MM).tolist()}
+                  for k, eye in enumerate(turning)]
+    meshes = [{"name": HEAD, "primitives": [_primitive(buffer, head, 0)]}]
     content = {
         "asset": {"version": "2.0", "generator": "Limn"},
         "scene": 0,
         "scenes": [{"name": name, "nodes": [0, 1]}],
-        "nodes": [{"name": "head", "mesh": 0}, {"name": "camera", "camera": 0}],
-        "meshes": [{"name": "head", "primitives": [_primitive(buffer, mesh)]}],
-        "materials": [material],
-        "extensionsUsed": ["KHR_materials_specular"],
+        "nodes": nodes,
+        "meshes": meshes + [{"name": eye.name, "primitives": [_primitive(buffer, eye, 1)]} for eye in turning],
+        "materials": [skin, _EYE_MATERIAL] if turning else [skin],
+        "extensionsUsed": ["KHR_materials_ior", "KHR_materials_specular"] if turning else ["KHR_materials_specular"],
         "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
         "images": [{"bufferView": view, "mimeType": "image/png"} for view in textures],
         "textures": [{"sampler": 0, "source": k} for k in range(len(textures))],
@@ -87,7 +114,7 @@ def write_glb(path: Path | str, name: str, mesh: Mesh, maps: Mapping[str, np.nda
                 "znear": 0.01,
             },
         }],
-        "animations": [_animation(buffer, capture)],
+        "animations": [_animation(buffer, capture, len(turning))],
     }
     content |= {
         "accessors": buffer.accessors,
@@ -97,16 +124,17 @@ def write_glb(path: Path | str, name: str, mesh: Mesh, maps: Mapping[str, np.nda
     _write_container(Path(path), content, bytes(buffer.data))
 
 
-def _primitive(buffer: _Buffer, mesh: Mesh) -> dict:
+def _primitive(buffer: _Buffer, part: RigidPart, material: int) -> dict:
     """glTF knows one index per corner: vertices are doubled along texture seams."""
+    mesh = part.mesh
     corners, index, _ = unique_pairs(np.column_stack([mesh.faces.ravel(), mesh.face_uvs.ravel()]))
     vertex, coordinate = corners.T
     attributes = {
         "POSITION": buffer.array(mesh.vertices[vertex] * METRES_PER_MM, _ARRAY, bounds=True),
-        "NORMAL": buffer.array(shading_normals(mesh)[vertex], _ARRAY),
+        "NORMAL": buffer.array(part.normals[vertex], _ARRAY),
         "TEXCOORD_0": buffer.array(mesh.uvs[coordinate] * [1.0, -1.0] + [0.0, 1.0], _ARRAY),
     }
-    return {"attributes": attributes, "indices": buffer.array(index.astype(np.uint32), _INDEX), "material": 0}
+    return {"attributes": attributes, "indices": buffer.array(index.astype(np.uint32), _INDEX), "material": material}
 
 
 def _material(buffer: _Buffer, maps: Mapping[str, np.ndarray]) -> tuple[list[int], dict]:
@@ -147,24 +175,39 @@ def _png(picture: np.ndarray) -> bytes:
     return encoded.tobytes()
 
 
-def _animation(buffer: _Buffer, capture: UsdCapture) -> dict:
-    """The motion of what moved, head (node 0) or camera (node 1), from 0 s at the first frame."""
+def _animation(buffer: _Buffer, capture: UsdCapture, eye_count: int) -> dict:
+    """The motion of what moved, head (node 0) or camera (node 1), from 0 s at the first frame; and how the eyes
+    turn."""
     node = 1 if capture.moves == "camera" else 0
     world_from_local = world_from_usd_camera(capture) if node else world_from_head_rigid(capture)
-    seconds = (capture.frame_index - capture.frame_index[0]) / capture.fps
-    quaternions = Rotation.from_matrix(world_from_local[:, :3, :3]).as_quat()
-    flips = np.cumprod(np.where((quaternions[1:] * quaternions[:-1]).sum(1) < 0.0, -1.0, 1.0))
-    quaternions[1:] *= flips[:, None]
-    time = buffer.array(seconds, bounds=True)
-    outputs = {
-        "translation": buffer.array(world_from_local[:, :3, 3] * METRES_PER_MM),
-        "rotation": buffer.array(quaternions),
-    }
+    time = buffer.array(_seconds(capture, capture.frame_index), bounds=True)
+    tracks = [
+        (node, "translation", time, buffer.array(world_from_local[:, :3, 3] * METRES_PER_MM)),
+        (node, "rotation", time, buffer.array(_quaternions(world_from_local[:, :3, :3]))),
+    ]
+    for k in range(eye_count):
+        frames, rotations = eye_turns(capture, k)
+        if len(frames):
+            open_eyes = buffer.array(_seconds(capture, frames), bounds=True)
+            tracks.append((_FIRST_EYE + k, "rotation", open_eyes, buffer.array(_quaternions(rotations))))
     return {
         "name": "clip",
-        "samplers": [{"input": time, "output": output, "interpolation": "LINEAR"} for output in outputs.values()],
-        "channels": [{"sampler": k, "target": {"node": node, "path": kind}} for k, kind in enumerate(outputs)],
+        "samplers": [{"input": times, "output": values, "interpolation": "LINEAR"} for _, _, times, values in tracks],
+        "channels": [{"sampler": k, "target": {"node": moved, "path": kind}}
+                     for k, (moved, kind, _, _) in enumerate(tracks)],
     }
+
+
+def _seconds(capture: UsdCapture, frames: np.ndarray) -> np.ndarray:
+    return (frames - capture.frame_index[0]) / capture.fps
+
+
+def _quaternions(rotations: np.ndarray) -> np.ndarray:
+    """[F, 3, 3] -> [F, 4], x y z w, neighbours in one hemisphere."""
+    quaternions = Rotation.from_matrix(rotations).as_quat()
+    flips = np.cumprod(np.where((quaternions[1:] * quaternions[:-1]).sum(1) < 0.0, -1.0, 1.0))
+    quaternions[1:] *= flips[:, None]
+    return quaternions
 
 
 def _write_container(path: Path, content: dict, binary: bytes) -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
 from shared.errors import InputError
+from shared.geometry.eyeballs import Eyeball
 from shared.geometry.mesh import Mesh
+from shared.geometry.parts import part_runs
 from shared.io.arrays import load_arrays, save_arrays
 
 
@@ -33,14 +37,22 @@ def load_mesh(path: Path | str) -> Mesh:
     return _checked(Mesh(*(arrays[name] for name in ("vertices", "faces", "uvs", "face_uvs"))), path)
 
 
-def write_obj(path: Path | str, mesh: Mesh) -> None:
-    """Vertices in millimetres of head space with four decimals, UVs with six, one-based indices."""
+def write_obj(path: Path | str, mesh: Mesh, eyes: Sequence[Eyeball] = ()) -> None:
+    """Vertices in millimetres of head space with four decimals, UVs with six, one-based indices; with the right and the
+    left eyeball, groups for the head and each of them. Faces stay in the mesh's order."""
     corners = np.stack([mesh.faces, mesh.face_uvs], axis=-1).reshape(len(mesh.faces), -1) + 1
     with open(path, "w", encoding="ascii") as file:
         file.write("# head space, millimetres; x right seen from the front, y up, z out of the face\n")
-        for line, rows in (("v %.4f %.4f %.4f\n", mesh.vertices), ("vt %.6f %.6f\n", mesh.uvs),
-                           ("f %d/%d %d/%d %d/%d\n", corners)):
-            file.write(line * len(rows) % tuple(rows.ravel().tolist()))
+        _write_rows(file, "v %.4f %.4f %.4f\n", mesh.vertices)
+        _write_rows(file, "vt %.6f %.6f\n", mesh.uvs)
+        for name, first, after in part_runs(len(corners), eyes):
+            if eyes:
+                file.write(f"g {name}\n")
+            _write_rows(file, "f %d/%d %d/%d %d/%d\n", corners[first:after])
+
+
+def _write_rows(file: TextIO, line: str, rows: np.ndarray) -> None:
+    file.write(line * len(rows) % tuple(rows.ravel().tolist()))
 
 
 def read_obj(path: Path | str) -> Mesh:

@@ -5,12 +5,16 @@
 
     /<subject>          Xform, default prim, kind component, assetInfo, inherits /__class__/<subject>
       geo/head          Mesh in millimetres, faceVarying UVs and normals
-      mtl/skin          Material: UsdPreviewSurface and OpenPBR
+      geo/eye_right     Mesh about the eyeball's centre, which it turns about; geo/eye_left likewise
+      mtl/skin          Material: UsdPreviewSurface and OpenPBR; mtl/eye likewise
       capture           camera, lights and the clip's card, in the variant "clip" of the variant set "capture"
 
-The variant "clip" (the default) replays the capture: the head's (or the camera's) motion as time samples, the
-light at rest, the clip on a card of purpose guide. The variant "still" leaves the head alone at head space's
-origin, for use in another scene.
+The variant "clip" (the default) replays the capture: the head's (or the camera's) motion and the eyes' gaze as time
+samples, the light at rest, the clip on a card of purpose guide. The variant "still" leaves the head alone at head
+space's origin, for use in another scene. There, and at the default time of "clip", the eyes look straight ahead.
+
+Where the clip's gaze is not known the eyes are part of geo/head, which then moves by itself. Else geo does, an Xform,
+and carries head and eyes.
 
 References: USD Working Group, Guidelines for structuring USD assets; UsdGeomMesh, UsdGeomCamera,
 UsdLuxDomeLight, UsdGeomModelAPI.
@@ -28,7 +32,9 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from shared.errors import LimnError
-from shared.geometry.mesh import Mesh, shading_normals
+from shared.geometry.eyeballs import Eyeball
+from shared.geometry.mesh import Mesh
+from shared.geometry.parts import EYES, HEAD, head_parts
 from shared.io.usd_capture import (
     BallLamp,
     Plate,
@@ -38,9 +44,11 @@ from shared.io.usd_capture import (
     define_dome_light,
     define_lamp,
     define_plate,
+    eye_turns,
+    turn,
     world_from_head_rigid,
 )
-from shared.io.usd_material import TextureFile, define_material
+from shared.io.usd_material import EYE, EYE_MAPS, TextureFile, define_material
 
 METERS_PER_UNIT = 0.001
 VARIANT_SET, VARIANT_CLIP, VARIANT_STILL = "capture", "clip", "still"
@@ -52,8 +60,9 @@ class HeadAsset:
     """Everything that goes into head.usda. Paths are relative to the layer.
 
     maps: {name of usd_material.SHADER_INPUTS: texture}; envmap: the dome light's texture; lamp: what stands near of the
-    light and is not in that texture, or None; plate: the clip's frames, or None; metadata: nested dictionaries of
-    strings, numbers and lists for the root prim's customData["limn"].
+    light and is not in that texture, or None; plate: the clip's frames, or None; eyes: the right and the left eyeball
+    of the mesh, to be meshes of their own, or none; metadata: nested dictionaries of strings, numbers and lists for the
+    root prim's customData["limn"].
     """
 
     name: str
@@ -63,6 +72,7 @@ class HeadAsset:
     capture: UsdCapture
     plate: Plate | None = None
     lamp: BallLamp | None = None
+    eyes: Sequence[Eyeball] = ()
     version: str = "1"
     metadata: Mapping[str, object] = field(default_factory=dict)
 
@@ -135,15 +145,30 @@ def _layer_metadata(stage: Usd.Stage) -> None:
 
 
 def _define_geometry(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None:
-    UsdGeom.Scope.Define(stage, root.AppendChild("geo"))
-    define_mesh(stage, str(root.AppendPath("geo/head")), asset.mesh)
+    geo = root.AppendChild("geo")
+    (UsdGeom.Xform if asset.eyes else UsdGeom.Scope).Define(stage, geo)
+    for part in head_parts(asset.mesh, asset.eyes):
+        prim = define_mesh(stage, str(geo.AppendChild(part.name)), part.mesh, part.normals)
+        if part.name in EYES:
+            prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*map(float, part.pivot)))
+            # The variants give its value: one that stood here would be stronger than theirs in a single layer.
+            prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
 
 
 def _define_materials(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None:
-    """The material and its binding: a layer that can be muted or replaced without the geometry."""
+    """The materials and their bindings: a layer that can be muted or replaced without the geometry."""
     UsdGeom.Scope.Define(stage, root.AppendChild("mtl"))
     material = define_material(stage, str(root.AppendPath("mtl/skin")), asset.maps)
-    mesh = stage.OverridePrim(root.AppendPath("geo/head"))
+    _bind(stage, root, HEAD, material)
+    if asset.eyes:
+        shared = {name: asset.maps[name] for name in EYE_MAPS if name in asset.maps}
+        eye = define_material(stage, str(root.AppendPath("mtl/eye")), shared, EYE)
+        for name in EYES:
+            _bind(stage, root, name, eye)
+
+
+def _bind(stage: Usd.Stage, root: Sdf.Path, name: str, material: UsdShade.Material) -> None:
+    mesh = stage.OverridePrim(root.AppendPath(f"geo/{name}"))
     UsdShade.MaterialBindingAPI.Apply(mesh).Bind(material)
 
 
@@ -177,12 +202,24 @@ def _define_variants(stage: Usd.Stage, root: Usd.Prim, asset: HeadAsset) -> None
     variants.SetVariantSelection(VARIANT_STILL)
     with variants.GetVariantEditContext():
         _set_extents(root, vertices[None])
+        _define_gaze(root, asset, moves=False)
     variants.SetVariantSelection(VARIANT_CLIP)
     with variants.GetVariantEditContext():
         moved = world_from_head_rigid(asset.capture)
         box = np.array(np.meshgrid(*np.stack([vertices.min(0), vertices.max(0)]).T)).reshape(3, -1).T
         _set_extents(root, np.einsum("fij,nj->fni", moved[:, :3, :3], box) + moved[:, None, :3, 3])
+        _define_gaze(root, asset, moves=True)
         _define_capture(stage, root, asset)
+
+
+def _define_gaze(root: Usd.Prim, asset: HeadAsset, moves: bool) -> None:
+    """The eyes straight ahead; moves: with the clip's gaze as time samples."""
+    for k, name in enumerate(EYES if asset.eyes else ()):
+        orient = UsdGeom.Mesh(root.GetPrimAtPath(f"geo/{name}")).GetOrientOp().GetAttr()
+        orient.Set(Gf.Quatd(1.0))
+        if moves:
+            frames, rotations = eye_turns(asset.capture, k)
+            turn(orient, rotations, frames)
 
 
 def _set_extents(root: Usd.Prim, points: np.ndarray) -> None:
@@ -203,7 +240,8 @@ def _define_capture(stage: Usd.Stage, root: Usd.Prim, asset: HeadAsset) -> None:
     if asset.plate is not None:
         define_plate(stage, str(scope.AppendChild("plate")), capture, asset.plate)
     if capture.moves == "head":
-        head = UsdGeom.Mesh(stage.GetPrimAtPath(root.GetPath().AppendPath("geo/head")))
+        moved = "geo" if asset.eyes else "geo/head"
+        head = UsdGeom.Xformable(stage.GetPrimAtPath(root.GetPath().AppendPath(moved)))
         animate(head, world_from_head_rigid(capture), capture.frame_index)
 
 
@@ -216,8 +254,8 @@ def _camera_metadata(capture: UsdCapture) -> dict:
     }
 
 
-def define_mesh(stage: Usd.Stage, path: str, mesh: Mesh) -> UsdGeom.Mesh:
-    """A polygon mesh (subdivisionScheme none) with indexed faceVarying UVs and normals, and its extent."""
+def define_mesh(stage: Usd.Stage, path: str, mesh: Mesh, normals: np.ndarray) -> UsdGeom.Mesh:
+    """A polygon mesh (subdivisionScheme none) with indexed faceVarying UVs and normals [V, 3], and its extent."""
     prim = UsdGeom.Mesh.Define(stage, path)
     points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.vertices, np.float32))
     faces = Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.faces.ravel(), np.int32))
@@ -232,7 +270,7 @@ def define_mesh(stage: Usd.Stage, path: str, mesh: Mesh) -> UsdGeom.Mesh:
     coordinates = primvars.CreatePrimvar("st", types.TexCoord2fArray, varying)
     coordinates.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(mesh.uvs, np.float32)))
     coordinates.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.face_uvs.ravel(), np.int32)))
-    normals = primvars.CreatePrimvar("normals", types.Normal3fArray, varying)
-    normals.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(shading_normals(mesh), np.float32)))
-    normals.SetIndices(faces)
+    corners = primvars.CreatePrimvar("normals", types.Normal3fArray, varying)
+    corners.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, np.float32)))
+    corners.SetIndices(faces)
     return prim

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, Vt
 
+from shared.geometry.eyeballs import gaze_rotation
 from shared.geometry.transforms import WORLD_FROM_CAMERA, invert_rigid
 from shared.io.usd_material import TextureFile, define_plate_material
 
@@ -39,7 +40,8 @@ class UsdCapture:
     height frame.
 
     moves: "head" or "camera", what turned while the light stood still. film_width_mm: width of the sensor
-    that the full frame shows. light_with_camera: the camera moved and carried the light along.
+    that the full frame shows. light_with_camera: the camera moved and carried the light along. gaze [F, 2, 2]: of the
+    right and the left eye, NaN while shut; None where it was not solved.
     """
 
     camera_from_head: np.ndarray
@@ -51,6 +53,7 @@ class UsdCapture:
     moves: str
     film_width_mm: float = DEFAULT_FILM_WIDTH_MM
     light_with_camera: bool = False
+    gaze: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -107,6 +110,16 @@ def world_from_head_rigid(capture: UsdCapture) -> np.ndarray:
     return turn @ capture.camera_from_head
 
 
+def eye_turns(capture: UsdCapture, eye: int) -> tuple[np.ndarray, np.ndarray]:
+    """Frames [n] in which an eye (0 right, 1 left) is open, and the rotations [n, 3, 3] of its gaze from straight
+    ahead. Who plays them turns evenly from one such frame to the next, also through a blink, and holds the first and
+    the last."""
+    if capture.gaze is None:
+        return np.zeros(0, int), np.zeros((0, 3, 3))
+    known = np.isfinite(capture.gaze[:, eye]).all(-1)
+    return np.asarray(capture.frame_index)[known], gaze_rotation(capture.gaze[known, eye])
+
+
 def animate(prim: UsdGeom.Xformable, world_from_local: np.ndarray, time_codes: np.ndarray) -> None:
     """Time samples [F, 4, 4] of a rigid motion as translate and orient.
 
@@ -115,15 +128,20 @@ def animate(prim: UsdGeom.Xformable, world_from_local: np.ndarray, time_codes: n
     """
     translate = prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
     orient = prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
-    last = Gf.Quatd(1.0)
     for transform, time in zip(world_from_local, time_codes, strict=True):
+        translate.Set(Gf.Vec3d(*(float(value) for value in transform[:3, 3])), float(time))
+    turn(orient.GetAttr(), world_from_local[:, :3, :3], time_codes)
+
+
+def turn(orient: Usd.Attribute, rotations: np.ndarray, time_codes: np.ndarray) -> None:
+    """Time samples of an orient op: rotations [F, 3, 3] as quaternions of one hemisphere; time_codes [F]: numbers of
+    frames."""
+    last = Gf.Quatd(1.0)
+    for matrix, time in zip(rotations, time_codes, strict=True):
         # Gf matrices act on row vectors.
-        rotation = (
-            Gf.Matrix3d(*(float(value) for value in transform[:3, :3].T.ravel())).ExtractRotation().GetQuat()
-        )
+        rotation = Gf.Matrix3d(*(float(value) for value in matrix.T.ravel())).ExtractRotation().GetQuat()
         if Gf.Dot(rotation, last) < 0.0:
             rotation = -rotation
-        translate.Set(Gf.Vec3d(*(float(value) for value in transform[:3, 3])), float(time))
         orient.Set(rotation, float(time))
         last = rotation
 

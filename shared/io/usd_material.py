@@ -1,4 +1,4 @@
-"""The skin material in USD: UsdPreviewSurface and MaterialX OpenPBR side by side, both fed by the same maps.
+"""Skin and eyes as materials in USD: UsdPreviewSurface and MaterialX OpenPBR side by side, both fed by the same maps.
 
 Limn's BRDF is albedo / pi + specular_intensity * GGX with Schlick's F0 = 0.04 and alpha = roughness^2.
 OpenPBR takes that as it is: specular_ior 1.5 gives F0 = 0.04, specular_weight scales it, specular_roughness
@@ -10,6 +10,9 @@ the map falls back to 1.5, intensity 1.
 
 Both models darken the diffuse layer by what the specular layer reflects (4 to 5 % at F0 = 0.04); Limn's BRDF
 does not.
+
+Eyes share the map of the albedo; over it lies the tear film, one smooth dielectric. OpenPBR's coat would lay a second
+interface over that one.
 
 References: UsdPreviewSurface specification 2.6; OpenPBR surface 1.1, section 3.6 (specular weight); MaterialX
 1.39.
@@ -25,6 +28,9 @@ from pxr import Gf, Sdf, Usd, UsdShade
 
 IOR = 1.5
 """Index of refraction whose F0, ((n - 1) / (n + 1))^2, is the 0.04 of the BRDF."""
+
+EYE_IOR, EYE_ROUGHNESS = 1.376, 0.08
+"""Of the cornea, which its tear film makes smooth."""
 
 # Limn's map -> (UsdPreviewSurface input, OpenPBR input): the one place where the names meet.
 SHADER_INPUTS = {
@@ -64,6 +70,19 @@ class TextureFile:
         return "sRGB" if self.colour_space == SRGB else "raw"
 
 
+@dataclass(frozen=True)
+class Finish:
+    """What no map says of a surface: its index of refraction and its roughness, None: the shaders' own."""
+
+    ior: float = IOR
+    roughness: float | None = None
+
+
+SKIN, EYE = Finish(), Finish(EYE_IOR, EYE_ROUGHNESS)
+EYE_MAPS = ("diffuse_albedo",)
+"""Those of SHADER_INPUTS that the eyes read: intensity, roughness and relief of the others are skin's."""
+
+
 def modulated_ior(specular_intensity: np.ndarray) -> np.ndarray:
     """[...] specular intensity -> [...] index of refraction whose F0 is 0.04 times the intensity.
 
@@ -75,11 +94,14 @@ def modulated_ior(specular_intensity: np.ndarray) -> np.ndarray:
     return ((1.0 + root) / (1.0 - root)).astype(np.float32)
 
 
-def define_material(stage: Usd.Stage, path: str, maps: Mapping[str, TextureFile]) -> UsdShade.Material:
-    """Defines the material from maps {name of SHADER_INPUTS: texture}; absent ones leave the input's default."""
+def define_material(
+    stage: Usd.Stage, path: str, maps: Mapping[str, TextureFile], finish: Finish = SKIN
+) -> UsdShade.Material:
+    """Defines the material from maps {name of SHADER_INPUTS: texture}; for absent ones the finish or the input's
+    default counts."""
     material = UsdShade.Material.Define(stage, path)
-    _preview_surface(stage, material, maps)
-    _open_pbr(stage, material, maps)
+    _preview_surface(stage, material, maps, finish)
+    _open_pbr(stage, material, maps, finish)
     return material
 
 
@@ -108,11 +130,15 @@ def define_plate_material(stage: Usd.Stage, path: str, files: Mapping[int, str])
     return material
 
 
-def _preview_surface(stage: Usd.Stage, material: UsdShade.Material, maps: Mapping[str, TextureFile]) -> None:
+def _preview_surface(
+    stage: Usd.Stage, material: UsdShade.Material, maps: Mapping[str, TextureFile], finish: Finish
+) -> None:
     surface = _shader(stage, material, "preview_surface", "UsdPreviewSurface")
     surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
     surface.CreateInput("useSpecularWorkflow", Sdf.ValueTypeNames.Int).Set(0)
-    surface.CreateInput("ior", Sdf.ValueTypeNames.Float).Set(IOR)
+    surface.CreateInput("ior", Sdf.ValueTypeNames.Float).Set(finish.ior)
+    if finish.roughness is not None:
+        surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(finish.roughness)
     reader = _shader(stage, material, "preview_st", "UsdPrimvarReader_float2")
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
     coordinates = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
@@ -136,9 +162,13 @@ def _preview_surface(stage: Usd.Stage, material: UsdShade.Material, maps: Mappin
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
 
 
-def _open_pbr(stage: Usd.Stage, material: UsdShade.Material, maps: Mapping[str, TextureFile]) -> None:
+def _open_pbr(
+    stage: Usd.Stage, material: UsdShade.Material, maps: Mapping[str, TextureFile], finish: Finish
+) -> None:
     surface = _shader(stage, material, "openpbr_surface", "ND_open_pbr_surface_surfaceshader")
-    surface.CreateInput("specular_ior", Sdf.ValueTypeNames.Float).Set(IOR)
+    surface.CreateInput("specular_ior", Sdf.ValueTypeNames.Float).Set(finish.ior)
+    if finish.roughness is not None:
+        surface.CreateInput("specular_roughness", Sdf.ValueTypeNames.Float).Set(finish.roughness)
     surface.CreateInput("base_diffuse_roughness", Sdf.ValueTypeNames.Float).Set(0.0)
     reader = _shader(stage, material, "openpbr_st", "ND_geompropvalue_vector2")
     reader.CreateInput("geomprop", Sdf.ValueTypeNames.String).Set("st")

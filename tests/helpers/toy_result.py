@@ -10,6 +10,8 @@ import numpy as np
 from shapes import sphere, turned
 
 from shared.contract.job import Parameters
+from shared.geometry.mesh import Mesh
+from shared.geometry.surface import Surface
 from shared.io.arrays import save_arrays, write_json
 from shared.io.images import write_exr, write_png
 from shared.io.meshes import save_mesh
@@ -26,6 +28,32 @@ def toy_mesh():
     """An egg the size of a head."""
     ball = sphere(1.0, 3)
     return ball.replace(vertices=ball.vertices * [75.0, 110.0, 95.0])
+
+
+EYE_CENTRES, EYE_RADIUS = np.array([[-31.0, 20.0, 78.0], [31.0, 20.0, 78.0]]), 12.0
+SEGMENTS = ("skin", "eyes")
+
+
+def toy_eyed_surface() -> Surface:
+    """The egg with two balls for eyes, the left one first, all in one atlas."""
+    egg, ball = toy_mesh(), sphere(1.0, 2)
+    balls = [ball.vertices * EYE_RADIUS + centre for centre in EYE_CENTRES[::-1]]
+    counts = np.cumsum([len(egg.vertices), len(ball.vertices)])
+    faces = [egg.faces, *(ball.faces + count for count in counts)]
+    mesh = Mesh(
+        np.concatenate([egg.vertices, *balls]),
+        np.concatenate(faces),
+        np.concatenate([egg.uvs * 0.5, ball.uvs * 0.25 + [0.5, 0.0], ball.uvs * 0.25 + [0.75, 0.0]]),
+        np.concatenate(faces),
+    )
+    return Surface(mesh, np.repeat([0, 1], [len(egg.faces), 2 * len(ball.faces)]).astype(np.uint8), SEGMENTS)
+
+
+def toy_gaze() -> np.ndarray:
+    """[F, 2, 2]: both eyes wander by up to 0.5 radians and are shut in the third frame."""
+    gaze = np.random.default_rng(8).uniform(-0.5, 0.5, (len(FRAMES), 2, 2))
+    gaze[2] = np.nan
+    return gaze
 
 
 def toy_poses(moves_by: float = 0.2) -> np.ndarray:
@@ -49,8 +77,9 @@ def toy_maps() -> dict[str, np.ndarray]:
     }
 
 
-def write_toy_work(work: Path, moves: str = "head") -> Path:
-    """Writes work/<stage>/ of all stages before the export. -> work."""
+def write_toy_work(work: Path, moves: str = "head", eyes: bool = False) -> Path:
+    """Writes work/<stage>/ of all stages before the export; eyes: of the mesh that has some, and their gaze. ->
+    work."""
     for stage in STAGE.inputs:
         (work / stage).mkdir(parents=True)
         write_json(work / stage / "manifest.json", {"stage": stage, "version": 2, "parameters": {"size": 64}})
@@ -58,10 +87,13 @@ def write_toy_work(work: Path, moves: str = "head") -> Path:
         write_json(work / stage / "provenance.json", costs)
     _write_frames(work / "sample_frames", moves)
     excluded = [{"frame_index": 4, "reason": "landmarks absent"}]
-    write_json(work / "track_landmarks" / "tracking.json", {"excluded": excluded, "warnings": []})
+    tracking = {"excluded": excluded, "warnings": [], "segments": SEGMENTS}
+    write_json(work / "track_landmarks" / "tracking.json", tracking)
     write_png(work / "track_landmarks" / "overlay.png", np.full((40, 120, 3), 90, np.uint8))
     write_png(work / "sample_frames" / "chart.png", np.full((40, 60, 3), 120, np.uint8))
     _write_solution(work / "inverse_render")
+    if eyes:
+        _write_eyes(work / "inverse_render")
     return work
 
 
@@ -113,6 +145,13 @@ def _write_solution(folder: Path) -> None:
         "render_frames": RENDERED,
     }
     write_json(folder / "solve.json", solve)
+
+
+def _write_eyes(folder: Path) -> None:
+    surface = toy_eyed_surface()
+    save_mesh(folder / "mesh.npz", surface.mesh, face_segment=surface.face_segment)
+    poses = {"camera_from_head": toy_poses(), "frame_index": FRAMES, "intrinsics": INTRINSICS}
+    save_arrays(folder / "poses.npz", **poses, gaze=toy_gaze())
 
 
 class ToyJob:

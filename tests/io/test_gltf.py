@@ -3,13 +3,26 @@
 import io
 import json
 import struct
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
-from toy_result import FRAMES, INTRINSICS, SOURCE_SIZE, toy_maps, toy_mesh, toy_poses
+from scipy.spatial.transform import Rotation
+from toy_result import (
+    EYE_CENTRES,
+    FRAMES,
+    INTRINSICS,
+    SOURCE_SIZE,
+    toy_eyed_surface,
+    toy_gaze,
+    toy_maps,
+    toy_mesh,
+    toy_poses,
+)
 
+from shared.geometry.eyeballs import eyeballs_of, gaze_rotation
 from shared.geometry.mesh import vertex_normals
 from shared.imaging.color import encode_srgb
 from shared.io.gltf import write_glb
@@ -130,6 +143,68 @@ def test_motion_and_lens(file, moves):
     lens = content["cameras"][0]["perspective"]
     assert np.tan(lens["yfov"] / 2) == pytest.approx(SOURCE_SIZE[1] / 2 / INTRINSICS[1, 1])
     assert np.tan(lens["yfov"] / 2) * lens["aspectRatio"] == pytest.approx(SOURCE_SIZE[0] / 2 / INTRINSICS[0, 0])
+
+
+def eye_rotations(content, binary, node):
+    """Seconds [n] and rotations [n, 3, 3] of the animation of a node."""
+    animation = content["animations"][0]
+    (channel,) = (row for row in animation["channels"] if row["target"]["node"] == node)
+    assert channel["target"]["path"] == "rotation"
+    sampler = animation["samplers"][channel["sampler"]]
+    assert sampler["interpolation"] == "LINEAR"
+    seconds, values = (accessor(content, binary, sampler[side]) for side in ("input", "output"))
+    return seconds[:, 0], Rotation.from_quat(values).as_matrix()
+
+
+@pytest.fixture
+def eyed(tmp_path, moves):
+    surface = toy_eyed_surface()
+    write_glb(tmp_path / "eyes.glb", NAME, surface.mesh, toy_maps(), replace(capture(moves), gaze=toy_gaze()),
+              eyeballs_of(surface))
+    return tmp_path / "eyes.glb"
+
+
+def test_eyes_turn_below_the_head(eyed):
+    """Nodes at the eyeballs' centres whose rotation is the gaze's, in the frames in which they are open."""
+    content, binary = chunks(eyed)
+    assert [content["nodes"][k]["name"] for k in content["nodes"][0]["children"]] == ["eye_right", "eye_left"]
+    assert content["scenes"][0]["nodes"] == [0, 1]
+    for k, node in enumerate(content["nodes"][0]["children"]):
+        np.testing.assert_allclose(content["nodes"][node]["translation"], EYE_CENTRES[k] * 0.001, atol=1e-9)
+        assert "rotation" not in content["nodes"][node]
+        is_open = np.isfinite(toy_gaze()[:, k]).all(1)
+        seconds, rotations = eye_rotations(content, binary, node)
+        np.testing.assert_allclose(seconds, (FRAMES[is_open] - FRAMES[0]) / 25.0, atol=1e-6)
+        np.testing.assert_allclose(rotations, gaze_rotation(toy_gaze()[is_open, k]), atol=1e-6)
+
+
+def test_parts_at_rest_are_the_mesh(eyed):
+    """trimesh places head and eyes: together the triangles of the one mesh, and every texture coordinate."""
+    scene, surface = trimesh.load(io.BytesIO(eyed.read_bytes()), file_type="glb"), toy_eyed_surface()
+    mesh, eyes = surface.mesh, eyeballs_of(surface)
+    order = np.concatenate([np.nonzero(surface.face_segment == 0)[0], *(np.sort(eye.faces) for eye in eyes)])
+    for name, faces in (("head", order[:512]), ("eye_right", order[512:640]), ("eye_left", order[640:])):
+        transform, key = scene.graph.get(name)
+        geometry = scene.geometry[key]
+        places = geometry.vertices @ transform[:3, :3].T + transform[:3, 3]
+        np.testing.assert_allclose(places[geometry.faces], mesh.vertices[mesh.faces[faces]] * 0.001, atol=1e-6)
+        np.testing.assert_allclose(geometry.visual.uv[geometry.faces], mesh.uvs[mesh.face_uvs[faces]], atol=1e-5)
+
+
+def test_eyes_have_a_material_of_their_own(eyed):
+    content, _ = chunks(eyed)
+    assert [content["meshes"][k]["primitives"][0]["material"] for k in range(3)] == [0, 1, 1]
+    skin, eye = content["materials"]
+    assert eye["pbrMetallicRoughness"]["baseColorTexture"] == skin["pbrMetallicRoughness"]["baseColorTexture"]
+    assert eye["pbrMetallicRoughness"]["roughnessFactor"] == 0.08
+    assert eye["extensions"]["KHR_materials_ior"]["ior"] == 1.376
+    assert content["extensionsUsed"] == ["KHR_materials_ior", "KHR_materials_specular"]
+
+
+def test_eyes_without_a_gaze_stay_at_rest(tmp_path):
+    surface = toy_eyed_surface()
+    write_glb(tmp_path / "a.glb", NAME, surface.mesh, toy_maps(), capture("head"), eyeballs_of(surface))
+    assert {row["target"]["node"] for row in chunks(tmp_path / "a.glb")[0]["animations"][0]["channels"]} == {0}
 
 
 def test_names_and_bytes(file, tmp_path, moves):

@@ -1,0 +1,58 @@
+"""A head's mesh in parts that turn by themselves: the head, and the eyeballs where they are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.geometry.eyeballs import SIDES, Eyeball
+from shared.geometry.mesh import Mesh, shading_normals
+
+HEAD, EYES = "head", tuple(f"eye_{side}" for side in SIDES)
+"""Names of the parts; the eyes in the order of SIDES."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigidPart:
+    """mesh: its vertices in the axes of head space, counted from the pivot [3] mm that the part turns about; normals
+    [V, 3]: those that the vertices have in the whole mesh."""
+
+    name: str
+    mesh: Mesh
+    normals: np.ndarray
+    pivot: np.ndarray
+
+
+def head_parts(mesh: Mesh, eyes: Sequence[Eyeball] = ()) -> tuple[RigidPart, ...]:
+    """The head, then the right and the left eyeball, which turn about their centres; the head alone without eyes.
+
+    All share the atlas: UVs stay where they are. Faces keep their order within a part.
+    """
+    normals = shading_normals(mesh)
+    if not eyes:
+        return (RigidPart(HEAD, mesh, normals, np.zeros(3)),)
+    rest = np.ones(len(mesh.faces), bool)
+    for eye in eyes:
+        rest[eye.faces] = False
+    whole = [(HEAD, np.nonzero(rest)[0], np.zeros(3))]
+    whole += [(name, np.sort(eye.faces), eye.centre) for name, eye in zip(EYES, eyes, strict=True)]
+    return tuple(_part(mesh, normals, *each) for each in whole)
+
+
+def _part(mesh: Mesh, normals: np.ndarray, name: str, faces: np.ndarray, pivot: np.ndarray) -> RigidPart:
+    used, corners = np.unique(mesh.faces[faces], return_inverse=True)
+    used_uvs, uv_corners = np.unique(mesh.face_uvs[faces], return_inverse=True)
+    part = Mesh(mesh.vertices[used] - pivot, corners.reshape(-1, 3), mesh.uvs[used_uvs], uv_corners.reshape(-1, 3))
+    return RigidPart(name, part, normals[used], pivot)
+
+
+def part_runs(face_count: int, eyes: Sequence[Eyeball]) -> list[tuple[str, int, int]]:
+    """Runs of faces that belong to one part, in the mesh's order: (name, first face, face after the last)."""
+    part = np.zeros(face_count, int)
+    for k, eye in enumerate(eyes):
+        part[eye.faces] = k + 1
+    starts = [0, *(np.nonzero(np.diff(part))[0] + 1).tolist()]
+    names = (HEAD, *EYES)
+    return [(names[part[a]], a, b) for a, b in zip(starts, [*starts[1:], face_count], strict=True)]
