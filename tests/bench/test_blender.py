@@ -7,9 +7,22 @@ import os
 
 import numpy as np
 import pytest
-from toy_result import FRAMES, INTRINSICS, MAP_SIZE, SOURCE_SIZE, ToyJob, toy_mesh, toy_poses, write_toy_work
+from toy_result import (
+    EYE_CENTRES,
+    FRAMES,
+    INTRINSICS,
+    MAP_SIZE,
+    SOURCE_SIZE,
+    ToyJob,
+    toy_gaze,
+    toy_mesh,
+    toy_poses,
+    write_toy_work,
+)
 
+from shared.geometry.eyeballs import gaze_rotation
 from shared.geometry.mesh import vertex_normals
+from shared.geometry.transforms import rigid
 from shared.io.images import write_png
 from stages import export_usd
 from tools.bench.peers.blender import VARIABLE, blender_python, compare_render, comparison_picture, probe
@@ -116,6 +129,32 @@ def test_what_blender_drops(seen):
     assert found.facts["material"]["nodes"].count("TEX_IMAGE") == 4  # the preview's four, none of OpenPBR's
     assert found.facts["fps"] == 24.0
     assert not any("limn" in name for name in found.facts["properties"])
+
+
+@pytest.fixture(scope="module", params=[*USD_FILES, "head.glb"])
+def eyed(request, tmp_path_factory):
+    """(file, what Blender made of the toy with eyes)."""
+    base = tmp_path_factory.mktemp("blender_eyes")
+    job = ToyJob(write_toy_work(base / "work", eyes=True), base / "export")
+    export_usd.run(job)
+    return request.param, probe(blender_python(), job.out / request.param, [int(frame) for frame in FRAMES])
+
+
+def test_eyes_arrive(eyed):
+    """Meshes and materials of their own, and, in USD, the gaze about the eyeballs' centres in every frame."""
+    file, found = eyed
+    assert found.facts["meshes"] == ["eye_left", "eye_right", "head"]
+    for material in found.facts["eye_materials"].values():
+        assert material["maps"]["diffuse_albedo"]["loaded"] and not material["maps"]["roughness"]
+        assert material["values"]["roughness"] == pytest.approx(0.08)
+        assert material["values"]["specular_ior"] == pytest.approx(1.376)
+    if file == "head.glb":
+        return  # see test_motion_arrives
+    gaze = toy_gaze()
+    for f in np.nonzero(np.isfinite(gaze).all((1, 2)))[0]:
+        for k, name in enumerate(("eye_right", "eye_left")):
+            expected = rigid(gaze_rotation(gaze[f, k]), EYE_CENTRES[k])
+            np.testing.assert_allclose(found.facts["eyes"][str(FRAMES[f])][name], expected, atol=1e-3)
 
 
 def test_cycles_agrees_with_our_render(tiny_run, tmp_path):

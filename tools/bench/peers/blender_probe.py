@@ -64,11 +64,12 @@ def mesh_arrays(thing):
 
 
 def materials(thing):
-    """{map: image} of the head's material and the names of its shading nodes."""
+    """{map: image} of a mesh's material, the names of its shading nodes, and its values where no image drives them."""
     tree = thing.data.materials[0].node_tree
     shader = next(node for node in tree.nodes if node.type == "BSDF_PRINCIPLED")
     found = {name: image_behind(shader.inputs[socket]) for socket, name in PRINCIPLED.items()}
-    return {"maps": found, "nodes": sorted(node.type for node in tree.nodes)}
+    values = {PRINCIPLED[socket]: shader.inputs[socket].default_value for socket in ("IOR", "Roughness")}
+    return {"maps": found, "nodes": sorted(node.type for node in tree.nodes), "values": values}
 
 
 def camera_facts(camera):
@@ -88,10 +89,10 @@ def light_facts():
     return {"image": image_behind(background.inputs["Color"]), "strength": strength}
 
 
-def relative_pose(head, camera):
-    """4x4: the camera's axes (y up, looking along -z) from the head's local ones, in the asset's unit."""
+def relative_pose(thing, other):
+    """4x4: the other's axes (a camera's: y up, looking along -z) from the thing's local ones, in the asset's unit."""
     graph = bpy.context.evaluated_depsgraph_get()
-    matrices = [np.array(thing.evaluated_get(graph).matrix_world) for thing in (camera, head)]
+    matrices = [np.array(each.evaluated_get(graph).matrix_world) for each in (other, thing)]
     return (np.linalg.inv(matrices[0]) @ matrices[1]).tolist()
 
 
@@ -116,23 +117,27 @@ def main():
     parser.add_argument("--samples", type=int, default=0)
     options = parser.parse_args()
     open_asset(options.asset.resolve())
-    scene, head, camera = bpy.context.scene, only("MESH"), only("CAMERA")[0]
+    scene, meshes, camera = bpy.context.scene, only("MESH"), only("CAMERA")[0]
     facts = {
         "version": bpy.app.version_string,
-        "meshes": sorted(thing.name for thing in head),
+        "meshes": sorted(thing.name for thing in meshes),
         "camera": camera_facts(camera),
         "light": light_facts(),
         "frames": [scene.frame_start, scene.frame_end],
         "fps": scene.render.fps / scene.render.fps_base,
         "properties": sorted(key for thing in bpy.data.objects for key in thing.keys()),
         "poses": {},
+        "eyes": {},
     }
-    head = max(head, key=lambda thing: len(thing.data.vertices))
+    head = max(meshes, key=lambda thing: len(thing.data.vertices))
+    eyes = [thing for thing in meshes if thing.name.startswith("eye_")]
     facts["material"] = materials(head)
+    facts["eye_materials"] = {eye.name: materials(eye) for eye in eyes}
     np.savez(options.out / "mesh.npz", **mesh_arrays(head))
     for frame in options.frames:
         scene.frame_set(frame)
         facts["poses"][str(frame)] = relative_pose(head, camera)
+        facts["eyes"][str(frame)] = {eye.name: relative_pose(eye, head) for eye in eyes}
         if options.samples:
             render(scene, camera, options.size, options.samples, options.out / f"{frame:04d}.exr")
     (options.out / "probe.json").write_text(json.dumps(facts, indent=2, sort_keys=True))
