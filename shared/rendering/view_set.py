@@ -12,12 +12,24 @@ ROUGHNESSES = (0.1, 0.3, 0.5, 0.8)
 
 
 @dataclass(frozen=True)
+class ViewCamera:
+    """camera_from_head [4, 4] mm, intrinsics [3, 3] px of a picture of size (width, height); gaze [2, 2] radians: how
+    the eyeballs are turned in the head that it looks at, None: straight ahead."""
+
+    camera_from_head: np.ndarray
+    intrinsics: np.ndarray
+    size: tuple[int, int]
+    gaze: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
 class ViewSet:
     """Pictures [h, w, 3], linear, 0 beside the head: novel {name of NOVEL_VIEWS} under the clip's light, relit {name of
-    studio_lights.STUDIO_LIGHTS}; visibility {roughness: [h, w], NaN beside the head}; held_out {frame: re-render of a
-    crop of the clip that took no part in the fit}."""
+    studio_lights.STUDIO_LIGHTS}, all seen by relit_camera; visibility {roughness: [h, w], NaN beside the head};
+    held_out {frame: re-render of a crop of the clip that took no part in the fit}."""
 
     novel: dict[str, np.ndarray]
     relit: dict[str, np.ndarray]
     visibility: dict[float, np.ndarray]
     held_out: dict[int, np.ndarray]
+    relit_camera: ViewCamera

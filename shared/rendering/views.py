@@ -7,7 +7,6 @@ is turned into it, and the head stays where it is ("moves: camera" to the shadin
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -28,7 +27,7 @@ from shared.rendering.shading import DEEP, Material, VertexShading
 from shared.rendering.split_sum import SplitSum
 from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
 from shared.rendering.transfer import Transfer, mesh_points
-from shared.rendering.view_set import NOVEL_VIEWS, ROUGHNESSES, ViewSet
+from shared.rendering.view_set import NOVEL_VIEWS, ROUGHNESSES, ViewCamera, ViewSet
 
 DISTANCE_MM, FILLED = 900.0, 1.1
 """The virtual camera's distance from the head's middle, and the head's half diagonal in half pictures."""
@@ -41,17 +40,6 @@ SAMPLES = 2
 """Rays along each edge of a pixel that tell how much of it the head covers."""
 HELD_OUT_SHOWN = 4
 """Held-out frames that the report re-renders beside the others."""
-
-
-@dataclass(frozen=True)
-class ViewCamera:
-    """camera_from_head [4, 4] mm, intrinsics [3, 3] px of a picture of size (width, height); gaze [2, 2] radians: how
-    the eyeballs are turned in the head that it looks at, None: straight ahead."""
-
-    camera_from_head: np.ndarray
-    intrinsics: np.ndarray
-    size: tuple[int, int]
-    gaze: np.ndarray | None = None
 
 
 def make_views(
@@ -82,6 +70,7 @@ def make_views(
         dict(zip(STUDIO_LIGHTS, views.relit([studio_light(name) for name in STUDIO_LIGHTS], camera), strict=True)),
         dict(zip(ROUGHNESSES, covered, strict=True)),
         dict(zip(held_out, again, strict=True)),
+        camera,
     )
 
 

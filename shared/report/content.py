@@ -11,13 +11,15 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from shared.geometry.eyeballs import Eyeball
 from shared.geometry.mesh import Mesh
 from shared.geometry.transforms import WORLD_FROM_CAMERA, invert_rigid
 from shared.io.arrays import read_json
 from shared.io.export_maps import SOLVED_MAPS
 from shared.io.frames import FrameSet
 from shared.io.images import read_exr, read_png
-from shared.rendering.view_set import ViewSet
+from shared.rendering.view_set import ViewCamera, ViewSet
+from shared.report.eye_pictures import close_up_frames, eye_rectangle
 
 SELECTION_SECONDS = "model_selection_seconds.json"
 RESULT_FILES = {"sample_frames": "frames.json", "track_landmarks": "tracking.json", "inverse_render": "solve.json"}
@@ -28,7 +30,8 @@ FRAMES_OF_OTHER_CLIPS = 3
 class Frame:
     """A frame of the clip beside its re-render, both [H, W, 3] linear, cropped alike; 0 where nothing was rendered.
 
-    clipped [H, W] bool: pixels whose code value is the maximum.
+    clipped [H, W] bool: pixels whose code value is the maximum; eyes: left, top, right and bottom px of a close-up of
+    both, of frames that are chosen for one.
     """
 
     frame_index: int
@@ -37,6 +40,7 @@ class Frame:
     render: np.ndarray
     clipped: np.ndarray
     held_out: bool
+    eyes: tuple[int, int, int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -69,9 +73,10 @@ class ReportContent:
 
     facts, numbers, files: (label, value) pairs. maps {name: [S, S] or [S, S, 3]}, envmap [H, W, 3] linear.
     angles_deg [F, 3] yaw, pitch, roll and position_mm [F, 3] at frame_index [F]. excluded: (frame, stage, reason).
-    views: None when they were not wished. selection: the models tried, one dictionary each, in order. residuals: nested
-    dictionaries of numbers. iterations: one dictionary of numbers each. warnings: (stage, text). parameters: (stage,
-    name, value). clips: all but the first, where there are several. methods: paragraphs and references.
+    views: None when they were not wished; relit_eyes: where its relit pictures show both eyes, as Frame.eyes. eyes: of
+    the mesh, or none. selection: the models tried, one dictionary each, in order. residuals: nested dictionaries of
+    numbers. iterations: one dictionary of numbers each. warnings: (stage, text). parameters: (stage, name, value).
+    clips: all but the first, where there are several. methods: paragraphs and references.
     """
 
     name: str
@@ -85,6 +90,8 @@ class ReportContent:
     angles_deg: np.ndarray
     position_mm: np.ndarray
     views: ViewSet | None = None
+    relit_eyes: tuple[int, int, int, int] | None = None
+    eyes: Sequence[Eyeball] = ()
     overlay: np.ndarray | None = None
     shape: np.ndarray | None = None
     chart: np.ndarray | None = None
@@ -120,7 +127,8 @@ class ReportInputs:
     """What the export holds in memory while it writes: the report's raw material.
 
     folders {stage: folder} of the stages before it; record: the content of run.json; files: (name, text) pairs; views:
-    None when they were not wished; clips: all but the first, where there are several; methods: paragraphs, references.
+    None when they were not wished; clips: all but the first, where there are several; methods: paragraphs, references;
+    eyes: the right and the left eyeball of the mesh, where poses say how they look, or none.
     """
 
     name: str
@@ -136,6 +144,7 @@ class ReportInputs:
     views: ViewSet | None = None
     clips: Sequence[ClipResult] = ()
     methods: tuple[Sequence[str], Sequence[str]] = ((), ())
+    eyes: Sequence[Eyeball] = ()
 
 
 def result_content(result: ReportInputs, frame_count: int) -> ReportContent:
@@ -153,10 +162,12 @@ def result_content(result: ReportInputs, frame_count: int) -> ReportContent:
         name=result.name,
         facts=_facts(frames, float(poses["intrinsics"][0, 0])),
         numbers=_numbers(angles, len(excluded), record),
-        frames=compared_frames(frames, solved / "renders", chosen, held_out, again),
+        frames=compared_frames(frames, solved / "renders", chosen, held_out, again, _eyes_in(result, chosen)),
         maps={name: result.maps[name] for name in SOLVED_MAPS},
         envmap=result.envmap,
         views=result.views,
+        relit_eyes=_eyes_seen_by(result.views.relit_camera, result.eyes) if result.views and result.eyes else None,
+        eyes=result.eyes,
         mesh=result.mesh,
         frame_index=poses["frame_index"],
         angles_deg=angles,
@@ -176,6 +187,23 @@ def result_content(result: ReportInputs, frame_count: int) -> ReportContent:
         clips=[_clip(clip) for clip in result.clips],
         methods=result.methods,
     )
+
+
+def _eyes_in(result: ReportInputs, chosen: Sequence[int]) -> dict[int, tuple[int, int, int, int]]:
+    """{frame: close-up of the eyes} of a few of the chosen frames; empty where no eyes are known."""
+    if not result.eyes:
+        return {}
+    poses, frames = result.poses, result.frames
+    place = {int(frame): f for f, frame in enumerate(poses["frame_index"])}
+    lens = poses.get("intrinsics_crop", frames.intrinsics)
+    shown = close_up_frames(chosen, poses["frame_index"], poses["camera_from_head"], poses["gaze"])
+    cameras = {frame: ViewCamera(poses["camera_from_head"][place[frame]], lens, frames.size) for frame in shown}
+    found = {frame: _eyes_seen_by(camera, result.eyes) for frame, camera in cameras.items()}
+    return {frame: rectangle for frame, rectangle in found.items() if rectangle}
+
+
+def _eyes_seen_by(camera: ViewCamera, eyes: Sequence[Eyeball]) -> tuple[int, int, int, int] | None:
+    return eye_rectangle(eyes, camera.camera_from_head, camera.intrinsics, camera.size)
 
 
 def _clip(clip: ClipResult) -> ClipContent:
@@ -312,10 +340,11 @@ def compared_frames(
     chosen: Sequence[int],
     held_out: Sequence[int],
     again: Mapping[int, np.ndarray] | None = None,
+    eyes: Mapping[int, tuple[int, int, int, int]] | None = None,
 ) -> Iterator[Frame]:
     """The chosen frames of the clip with their re-renders, one at a time: those in again {frame: [H, W, 3]}, else from
-    the folder renders."""
-    known = again or {}
+    the folder renders. eyes {frame: close-up as in Frame}."""
+    known, close_ups = again or {}, eyes or {}
     for frame_index in chosen:
         position = frames.position(frame_index)
         codes = frames.read_codes(position)
@@ -327,4 +356,5 @@ def compared_frames(
             render=found,
             clipped=(codes >= np.iinfo(codes.dtype).max - (1 if codes.dtype == np.uint8 else 256)).any(-1),
             held_out=frame_index in set(held_out),
+            eyes=close_ups.get(frame_index),
         )

@@ -19,6 +19,7 @@ from shared.rendering.view_set import NOVEL_VIEWS, ViewSet
 from shared.report.advice import advice
 from shared.report.charts import line_chart
 from shared.report.content import ClipContent, Frame, ReportContent, number
+from shared.report.eye_pictures import close_up
 from shared.report.pictures import (
     ERROR_RANGE,
     error_bytes,
@@ -29,7 +30,7 @@ from shared.report.pictures import (
     viridis_bytes,
 )
 from shared.report.template import filled
-from shared.report.viewer import irradiance_harmonics, packed, reduced
+from shared.report.viewer import WET, irradiance_harmonics, packed, reduced
 
 TEMPLATES = Path(__file__).with_name("templates")
 FRAME_PIXELS, MAP_PIXELS, LIGHT_PIXELS, OVERLAY_PIXELS = 440, 1024, 768, 1500
@@ -64,7 +65,10 @@ class Figure:
 
 def report_html(content: ReportContent) -> str:
     """The page as text. Deterministic: the same content gives the same text."""
-    frames = [comparison_frame(frame) for frame in content.frames]
+    frames, eyes = [], []
+    for frame in content.frames:
+        frames.append(comparison_frame(frame))
+        eyes += eye_close_ups(frame)
     paragraphs, references = content.methods
     return str(filled(TEMPLATES, "report.html.j2", {
         "name": content.name,
@@ -73,6 +77,8 @@ def report_html(content: ReportContent) -> str:
         "warnings": [(stage, text, advice(text)) for stage, text in content.warnings],
         "frames": frames,
         "error_range": ERROR_RANGE,
+        "eyes": eyes,
+        "relit_eyes": relit_eyes(content.views, content.relit_eyes),
         "maps": [map_picture(name, np.asarray(values)) for name, values in content.maps.items()],
         "shape": _one(content.shape, SHEET_PIXELS, "the shape from three sides", _SHAPE),
         "views": view_pictures(content.views) if content.views else None,
@@ -124,6 +130,23 @@ def comparison_frame(frame: Frame) -> dict:
         "psnr": psnr,
         "held_out": frame.held_out,
     }
+
+
+def eye_close_ups(frame: Frame) -> list[Figure]:
+    """Both eyes in the clip and in the re-render, of a frame chosen for that; else nothing."""
+    if frame.eyes is None:
+        return []
+    text = f", frame {frame.frame_index}, {'held out' if frame.held_out else 'fitted'}"
+    return [Figure(jpeg_uri(close_up(picture, frame.eyes)), f"the eyes, {title.lower()}{text}", title, text)
+            for title, picture in (("Clip", frame.clip), ("Re-render", frame.render))]
+
+
+def relit_eyes(views: ViewSet | None, rectangle: tuple[int, int, int, int] | None) -> list[Figure]:
+    """Both eyes, left, top, right and bottom px of the relit pictures, under each of the other lights."""
+    if views is None or rectangle is None:
+        return []
+    return [Figure(jpeg_uri(close_up(picture, rectangle)), f"the eyes: {STUDIO_LIGHTS[name]}", name.replace("_", " "),
+                   f": {STUDIO_LIGHTS[name]}") for name, picture in views.relit.items()]
 
 
 def map_picture(name: str, values: np.ndarray) -> Figure:
@@ -298,8 +321,12 @@ def _viewer_data(content: ReportContent) -> dict | None:
     if small is None:
         return None
     roughness, specular = content.maps.get("roughness"), content.maps.get("specular_intensity")
+    wet = np.zeros(len(content.mesh.vertices), bool)
+    for eye in content.eyes:
+        wet[eye.vertices] = True
     return {
-        "mesh": packed(small, vertex_normals(content.mesh.vertices, content.mesh.faces)),
+        "mesh": packed(small, vertex_normals(content.mesh.vertices, content.mesh.faces), wet),
+        "wet": WET,
         "albedo": jpeg_uri(srgb_bytes(shrunk(content.maps["diffuse_albedo"], VIEWER_TEXTURE_PIXELS))),
         "harmonics": np.round(irradiance_harmonics(content.envmap), 6).tolist(),
         "roughness": 0.4 if roughness is None else round(float(np.median(roughness)), 4),

@@ -15,6 +15,11 @@ FACE_LIMIT = 40_000
 """About 700 kB on the page; the eye sees no difference at its size."""
 
 
+WET = (0.2, 0.63)
+"""Roughness and specular intensity of eyes: the view's lamp has no extent, so they stand for a tear film under a small
+one, whose catchlight fills some pixels. 0.63 times F0 = 0.04 is that of an index of refraction of 1.376."""
+
+
 def coarser(mesh: Mesh) -> Mesh | None:
     """The mesh before its last subdivision, or None when it is none: F / 4 faces over the same vertices and UVs.
 
@@ -44,11 +49,12 @@ def reduced(mesh: Mesh, face_limit: int = FACE_LIMIT) -> Mesh | None:
     return current
 
 
-def packed(mesh: Mesh, normals: np.ndarray) -> dict:
+def packed(mesh: Mesh, normals: np.ndarray, wet: np.ndarray | None = None) -> dict:
     """For viewer.js: one vertex per distinct corner, positions and UVs as uint16, normals as int8, base64.
 
-    normals [V, 3], such as those of the mesh before it was reduced. -> {"count", "positions", "normals", "uvs",
-    "faces", "low" [3], "size" [3]}; position = low + size * q / 65535 mm.
+    normals [V, 3], such as those of the mesh before it was reduced; wet [V] bool: vertices of the eyes, whose normals
+    have a fourth component of 127, else 0. -> {"count", "positions", "normals", "uvs", "faces", "low" [3], "size" [3]};
+    position = low + size * q / 65535 mm.
     """
     uv_codes = np.round(np.clip(mesh.uvs, 0.0, 1.0) * 65535).astype(np.int64)
     keys = np.column_stack([mesh.faces.ravel(), uv_codes[mesh.face_uvs.ravel()]])
@@ -59,6 +65,8 @@ def packed(mesh: Mesh, normals: np.ndarray) -> dict:
     positions, padded = np.zeros((len(corners), 4), "<u2"), np.zeros((len(corners), 4), np.int8)
     positions[:, :3] = np.round((mesh.vertices[used] - low) / size * 65535)
     padded[:, :3] = np.round(normals[used] * 127)
+    if wet is not None:
+        padded[:, 3] = np.where(wet[used], 127, 0)
     return {
         "count": int(index.size),
         "positions": _text(positions),

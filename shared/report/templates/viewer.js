@@ -9,12 +9,12 @@ function startViewer(canvas, data) {
     return;
   }
   const vertexSource = `
-    attribute vec3 position; attribute vec3 normal; attribute vec2 uv;
+    attribute vec3 position; attribute vec4 normal; attribute vec2 uv;
     uniform vec3 low, size, centre; uniform mat3 turn; uniform float zoom, aspect;
-    varying vec3 n, p; varying vec2 st;
+    varying vec3 n, p; varying vec2 st; varying float eye;
     void main() {
       p = turn * (low + size * position - centre);
-      n = turn * normal; st = uv;
+      n = turn * normal.xyz; st = uv; eye = normal.w;
       float depth = 3.2 - p.z;
       vec2 xy = p.xy * zoom * 3.2;
       gl_Position = vec4(aspect > 1.0 ? xy.x / aspect : xy.x, aspect > 1.0 ? xy.y : xy.y * aspect,
@@ -22,8 +22,9 @@ function startViewer(canvas, data) {
     }`;
   const fragmentSource = `
     precision highp float;
-    varying vec3 n, p; varying vec2 st;
-    uniform sampler2D albedo; uniform vec3 harmonics[9], lamp; uniform float clip, power, specular, rough, plain;
+    varying vec3 n, p; varying vec2 st; varying float eye;
+    uniform sampler2D albedo; uniform vec3 harmonics[9], lamp; uniform float clip, power, plain;
+    uniform vec2 skin, wet;  // roughness and specular intensity
     vec3 toLinear(vec3 c) { return mix(c / 12.92, pow((c + 0.055) / 1.055, vec3(2.4)), step(0.04045, c)); }
     vec3 toCodes(vec3 c) { return mix(12.92 * c, 1.055 * pow(max(c, 1e-5), vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c)); }
     void main() {
@@ -33,11 +34,12 @@ function startViewer(canvas, data) {
       vec3 sky = harmonics[0] + harmonics[1] * m.y + harmonics[2] * m.z + harmonics[3] * m.x + harmonics[4] * m.x * m.y
         + harmonics[5] * m.y * m.z + harmonics[6] * (3.0 * m.z * m.z - 1.0) + harmonics[7] * m.x * m.z
         + harmonics[8] * (m.x * m.x - m.y * m.y);
-      float nl = max(dot(N, L), 0.0), nv = max(dot(N, V), 0.05), nh = dot(N, H), a = rough * rough, a2 = a * a;
+      vec2 finish = eye > 0.5 ? wet : skin;
+      float nl = max(dot(N, L), 0.0), nv = max(dot(N, V), 0.05), nh = dot(N, H), a = finish.x * finish.x, a2 = a * a;
       float d = a2 / (3.14159 * pow(nh * nh * (a2 - 1.0) + 1.0, 2.0));
       float f = 0.04 + 0.96 * pow(1.0 - max(dot(V, H), 0.0), 5.0), k = a / 2.0;
       float g = 1.0 / ((nl * (1.0 - k) + k) * (nv * (1.0 - k) + k));
-      vec3 colour = base * max(sky, 0.0) * clip + (base + 3.14159 * specular * d * f * g / 4.0) * nl * power;
+      vec3 colour = base * max(sky, 0.0) * clip + (base + 3.14159 * finish.y * d * f * g / 4.0) * nl * power;
       gl_FragColor = vec4(toCodes(clamp(colour, 0.0, 1.0)), 1.0);
     }`;
   const program = gl.createProgram();
@@ -61,7 +63,7 @@ function startViewer(canvas, data) {
   }
   const mesh = data.mesh, scale = 2 / Math.max(...mesh.size);
   attribute("position", mesh.positions, 3, gl.UNSIGNED_SHORT, true, 8);
-  attribute("normal", mesh.normals, 3, gl.BYTE, true, 4);
+  attribute("normal", mesh.normals, 4, gl.BYTE, true, 4);
   attribute("uv", mesh.uvs, 2, gl.UNSIGNED_SHORT, true, 4);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, bytes(mesh.faces), gl.STATIC_DRAW);
@@ -69,8 +71,8 @@ function startViewer(canvas, data) {
   gl.uniform3fv(uniform("size"), mesh.size.map((x) => x * scale));
   gl.uniform3fv(uniform("centre"), mesh.low.map((x, i) => (x + mesh.size[i] / 2) * scale));
   gl.uniform3fv(uniform("harmonics"), data.harmonics.flat());
-  gl.uniform1f(uniform("specular"), data.specular);
-  gl.uniform1f(uniform("rough"), data.roughness);
+  gl.uniform2f(uniform("skin"), data.roughness, data.specular);
+  gl.uniform2fv(uniform("wet"), data.wet);
   gl.enable(gl.DEPTH_TEST);
 
   const state = { yaw: 0.35, pitch: 0.05, lampYaw: -0.9, lampPitch: 0.5, zoom: 0.95, ready: false };
