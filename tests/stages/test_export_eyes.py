@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from field_check import field_faults
 from pxr import Gf, Usd, UsdGeom, UsdShade
 from toy_result import EYE_CENTRES, FRAMES, ToyJob, toy_eyed_surface, toy_gaze, toy_poses, write_toy_work
 
+from shared.contract.records import EXPORTED_POSES
 from shared.geometry.eyeballs import eyeballs_of, gaze_rotation
 from shared.geometry.mesh import vertex_normals
 from shared.geometry.transforms import rigid
@@ -128,7 +130,9 @@ def test_obj_and_poses_hold_the_eyes(exported):
     np.testing.assert_allclose(back.vertices, surface.mesh.vertices, atol=1e-4)
     right = np.array([int(corner.split("/")[0]) - 1 for line in faces["eye_right"] for corner in line.split()[1:]])
     assert back.vertices[right, 0].max() < 0
-    np.testing.assert_array_equal(load_arrays(folder / "poses.npz")["gaze"], toy_gaze())
+    poses = load_arrays(folder / "poses.npz")
+    np.testing.assert_array_equal(poses["gaze"], toy_gaze())
+    assert field_faults(poses, EXPORTED_POSES) == []
 
 
 def test_eyes_whose_gaze_is_not_known_stay_in_the_head(tmp_path):
