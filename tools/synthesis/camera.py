@@ -1,7 +1,7 @@
 """Pictures of the lit surface: radiance, and the buffers of the truth.
 
 Each pixel averages a regular grid of sub x sub primary rays. Diffuse light comes from the irradiance atlas, the
-specular part from samples of its own.
+specular part from samples of its own. Living eyes are painted and mirror by the gaze of the shot (iris).
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ from shared.geometry.mesh import normalised
 from shared.geometry.transforms import camera_centres, project
 from shared.imaging.texture import sample_bilinear
 from shared.rendering.envmap import latlong_lookup
-from tools.synthesis.highlights import SAMPLE_SETS, LobeSamples, specular_radiance
+from tools.synthesis.eye_light import eye_irradiance
+from tools.synthesis.highlights import SAMPLE_SETS, LobeSamples, mirrored_radiance, specular_radiance
+from tools.synthesis.iris import WET_SPECULAR, EyePaint
 from tools.synthesis.irradiance import SyntheticShot
 from tools.synthesis.light import EnvironmentLight
-from tools.synthesis.surface import SyntheticSurface
+from tools.synthesis.surface import ShadingPoints, SyntheticSurface
 
 TEXTURES = ("albedo", "specular", "roughness")
 
@@ -46,9 +48,10 @@ class PictureQuality:
 
 
 def take_picture(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray, shot: SyntheticShot,
-                 camera: PinholeCamera,
-                 quality: PictureQuality) -> dict[str, np.ndarray]:
-    """irradiance [size, size, 3] of this shot -> float32 images by name.
+                 camera: PinholeCamera, quality: PictureQuality,
+                 eyes: EyePaint | None = None) -> dict[str, np.ndarray]:
+    """irradiance [size, size, 3] of this shot -> float32 images by name. eyes: how the head's look, if it has living
+    ones.
 
     radiance [H, W, 3]; albedo [H, W, 3], normal [H, W, 3] (head space), specular and roughness [H, W]: means over the
     rays that hit the head, 0 where none does; depth (camera z, mm), mask (face skin) and head [H, W]: means over all
@@ -66,8 +69,9 @@ def take_picture(surface: SyntheticSurface, light: EnvironmentLight, irradiance:
     for order, offset in enumerate(np.ndindex(quality.sub, quality.sub)):
         shift = (np.array(offset[::-1]) + 0.5) / quality.sub
         hit, directions, values = _primary_hits(surface, shot, camera, pixels + shift)
+        wet = None if eyes is None else _look_at_eyes(eyes, shot, directions, values)
         values["radiance"] = _shade(surface, light, irradiance, shot, directions, values, samples.part(order, rays),
-                                    choice[hit])
+                                    choice[hit], wet, order)
         column, row = pixels[hit].T
         total["radiance"][row, column] -= background[row, column]
         for name in ("radiance", "normal", "depth", "mask", "head", *TEXTURES):
@@ -117,15 +121,40 @@ def _primary_hits(surface: SyntheticSurface, shot: SyntheticShot, camera: Pinhol
     points = surface.points(face[hit], bary[hit])
     values = {name: sample_bilinear(getattr(surface.materials, name), points.uv) for name in TEXTURES}
     inside = sample_bilinear(surface.materials.mask, points.uv) > 0.5
-    return hit, directions[hit], {**values, "points": points, "normal": points.normal, "depth": depth[hit],
-                                  "mask": inside, "head": np.ones(len(hit), np.float32)}
+    return hit, directions[hit], {**values, "face": face[hit], "points": points, "normal": points.normal,
+                                  "depth": depth[hit], "mask": inside, "head": np.ones(len(hit), np.float32)}
+
+
+def _look_at_eyes(eyes: EyePaint, shot: SyntheticShot, directions: np.ndarray,
+                  values: dict) -> tuple[np.ndarray, ShadingPoints]:
+    """Paints the values of hits on eyeballs with what the shot's gaze turns there -> their index [K] among the hits,
+    and the points of their wet surface."""
+    side = eyes.eyes.face_side[np.minimum(values["face"], len(eyes.eyes.face_side) - 1)]
+    side = np.where(values["face"] < len(eyes.eyes.face_side), side, -1)
+    index = np.nonzero(side >= 0)[0]
+    points = values["points"].select(index)
+    albedo, roughness, place, normal = eyes.look(points.position, normalised(directions[index]), side[index], shot.gaze)
+    for name, value in (("albedo", albedo), ("specular", WET_SPECULAR), ("roughness", roughness)):
+        values[name][index] = value
+    place, normal = place.astype(np.float32), normal.astype(np.float32)
+    return index, ShadingPoints(place, normal, normal, points.uv)
 
 
 def _shade(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray, shot: SyntheticShot,
-           directions: np.ndarray,
-           values: dict, samples: LobeSamples, choice: np.ndarray) -> np.ndarray:
-    """[M, 3] radiance towards the camera: albedo / pi times irradiance, plus the specular lobe."""
+           directions: np.ndarray, values: dict, samples: LobeSamples, choice: np.ndarray,
+           wet: tuple[np.ndarray, ShadingPoints] | None, order: int) -> np.ndarray:
+    """[M, 3] radiance towards the camera: albedo / pi times irradiance, plus the specular lobe. At the wet points the
+    lobe is narrow and the irradiance is traced anew, with random numbers of the ray's order in its pixel."""
+    outgoing = -normalised(directions)
     specular = specular_radiance(surface, light, irradiance, shot.world_from_head, values["points"],
-                                 -normalised(directions), values["roughness"], samples, choice)
-    diffuse = values["albedo"] * sample_bilinear(irradiance, values["points"].uv) / np.float32(np.pi)
+                                 outgoing, values["roughness"], samples, choice)
+    if wet is not None and len(wet[0]):
+        index, points = wet
+        specular[index] = mirrored_radiance(surface, light, irradiance, shot.world_from_head, points, outgoing[index],
+                                            values["roughness"][index], samples, choice[index])
+    arriving = sample_bilinear(irradiance, values["points"].uv)
+    if wet is not None and len(wet[0]):
+        rng = np.random.default_rng([shot.seed, 14, order])
+        arriving[wet[0]] = eye_irradiance(surface, light, irradiance, shot, values["points"].select(wet[0]), rng)
+    diffuse = values["albedo"] * arriving / np.float32(np.pi)
     return diffuse + values["specular"][:, None] * specular

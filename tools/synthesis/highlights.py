@@ -1,11 +1,13 @@
 """The GGX lobe of shading points, integrated in two parts that add up to the whole.
 
 Visible-normal samples see the smooth light and, where they are blocked, the diffuse radiosity of what they hit; light
-samples see the lamps. Neither part has a narrow peak that the other's samples would miss.
+samples see the lamps. Neither part has a narrow peak that the other's samples would miss. Wet surfaces are smoother
+than lamps are small: there visible-normal samples see the lamps as well.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,23 +64,38 @@ def specular_radiance(surface: SyntheticSurface, light: EnvironmentLight, irradi
 
     irradiance [size, size, 3] of the shot lights what the lobe sees of the head itself; choice [N]: set of each point.
     """
-    smooth = _smooth_part(surface, light, irradiance, world_from_head, points, outgoing, roughness,
-                          samples.lobe[choice])
+    def smooth_radiance(_: np.ndarray, towards: np.ndarray) -> np.ndarray:
+        return light.smooth_radiance(towards @ world_from_head.T.astype(np.float32))
+
+    smooth = _sampled_lobe(surface, smooth_radiance, irradiance, points, outgoing, roughness, samples.lobe[choice])
     lamps = _lamp_part(surface, points, outgoing, roughness, *samples.of_lamps(points.position, choice))
     return smooth + lamps
 
 
-def _smooth_part(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray,
-                 world_from_head: np.ndarray,
-                 points: ShadingPoints, outgoing: np.ndarray, roughness: np.ndarray,
-                 squares: np.ndarray) -> np.ndarray:
-    """Visible-normal sampling: each sample's weight is F G1(i), the rest of the lobe cancels against its density."""
+def mirrored_radiance(surface: SyntheticSurface, light: EnvironmentLight, irradiance: np.ndarray,
+                      world_from_head: np.ndarray, points: ShadingPoints, outgoing: np.ndarray, roughness: np.ndarray,
+                      samples: LobeSamples, choice: np.ndarray) -> np.ndarray:
+    """As specular_radiance, of surfaces that are nearly mirrors: roughness 0.1 or less."""
+    def radiance(origins: np.ndarray, towards: np.ndarray) -> np.ndarray:
+        met = towards if samples.lamps_at is None else samples.lamps_at.met_by(origins, towards).astype(np.float32)
+        turn = world_from_head.T.astype(np.float32)
+        return light.smooth_radiance(towards @ turn) + light.lamp_radiance(met @ turn)
+
+    return _sampled_lobe(surface, radiance, irradiance, points, outgoing, roughness, samples.lobe[choice])
+
+
+def _sampled_lobe(surface: SyntheticSurface, radiance: Callable[[np.ndarray, np.ndarray], np.ndarray],
+                  irradiance: np.ndarray, points: ShadingPoints, outgoing: np.ndarray, roughness: np.ndarray,
+                  squares: np.ndarray) -> np.ndarray:
+    """Visible-normal sampling: each sample's weight is F G1(i), the rest of the lobe cancels against its density.
+
+    radiance: of the light, from origins [N, 3] mm along directions [N, 3] in head space."""
     directions, weight = sample_lobe(points.normal, outgoing, roughness, squares)
     row, column = np.nonzero((weight > 0) & (np.einsum("nkc,nc->nk", directions, points.geometric_normal) > 0))
     towards = directions[row, column]
     index, uv, free = surface.hits(points.origins[row], towards)
     incident = np.zeros_like(towards)
-    incident[free] = light.smooth_radiance(towards[free] @ world_from_head.T.astype(np.float32))
+    incident[free] = radiance(points.origins[row[free]], towards[free])
     incident[index] = _radiosity(surface, irradiance, uv)
     total = np.zeros(directions.shape, np.float32)
     total[row, column] = incident * weight[row, column, None]

@@ -26,16 +26,20 @@ from tools.synthesis.sampling import random_rotation, shifted_hammersley
 from tools.synthesis.surface import ShadingPoints, SyntheticSurface, nearest_texel
 
 BATCH = 1024
+REFRESHED_BOUNCES = 3
 
 
 @dataclass(frozen=True)
 class SyntheticShot:
-    """One picture to take: camera_from_head [4, 4], world_from_head [3, 3], which light and the random seed."""
+    """One picture to take: camera_from_head [4, 4], world_from_head [3, 3], which light and the random seed; of living
+    eyes the gaze [2, 2] and which of the scene's states their lids are in."""
 
     camera_from_head: np.ndarray
     world_from_head: np.ndarray
     light: int
     seed: int
+    gaze: np.ndarray | None = None
+    lids: int = 0
 
     @property
     def place(self) -> np.ndarray:
@@ -68,6 +72,12 @@ class GroupResult:
     direct: np.ndarray
     bounce: sparse.csr_matrix
 
+    def open_ones(self) -> GroupResult:
+        """Without texels that see nothing: they lie within the surface, as an eyeball does behind its lids, and must
+        not darken what is beside them."""
+        seeing = self.direct.any((1, 2)) | (np.diff(self.bounce.indptr) > 0)
+        return GroupResult(self.texels[seeing], self.direct[seeing], self.bounce[seeing])
+
 
 def covered_texels(surface: SyntheticSurface, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Flat texel indices [T] that the UV layout covers, their face [T] and corner weights [T, 3]."""
@@ -77,11 +87,14 @@ def covered_texels(surface: SyntheticSurface, size: int) -> tuple[np.ndarray, np
 
 
 def group_irradiance(surface: SyntheticSurface, lights: list[EnvironmentLight], shots: list[SyntheticShot], group: int,
-                     quality: IrradianceQuality, seed: int) -> GroupResult:
-    """Traces one of `quality.groups` groups of texels; independent of all others."""
+                     quality: IrradianceQuality, seed: int, only: np.ndarray | None = None) -> GroupResult:
+    """Traces one of `quality.groups` groups of texels; independent of all others. only [size^2] bool: the texels that
+    are asked for, all if None."""
     rng = np.random.default_rng([seed, group])
     texels, face, bary = covered_texels(surface, quality.size)
     chosen = np.random.default_rng(seed).integers(quality.groups, size=len(texels)) == group
+    if only is not None:
+        chosen &= only[texels]
     points = surface.points(face[chosen], bary[chosen])
     directions = (fibonacci_sphere(quality.directions) @ random_rotation(rng).T).astype(np.float32)
     incident = np.stack([lights[shot.light].smooth_radiance(directions @ shot.world_from_head.T.astype(np.float32))
@@ -184,8 +197,7 @@ def assemble_atlas(
     direct = np.zeros((size * size, *shape), np.float32)
     direct[texels] = np.concatenate([result.direct for result in results])
     source = _nearest_covered(texels, size)
-    centres = (np.stack(np.meshgrid(np.arange(size), np.arange(size)), -1).reshape(-1, 2) + 0.5) / size
-    albedo = surface.albedo(centres * [1, -1] + [0, 1]).astype(np.float32)
+    albedo = _texel_albedo(surface, size)
     total = direct
     for _ in range(bounces):
         radiosity = (albedo[:, None] * total)[source].reshape(size * size, -1)
@@ -193,6 +205,29 @@ def assemble_atlas(
         for result in results:
             total[result.texels] += (result.bounce @ radiosity).reshape(-1, *shape)
     return total[source].reshape(size, size, *shape)
+
+
+def refresh_atlas(surface: SyntheticSurface, atlas: np.ndarray, results: list[GroupResult], near: np.ndarray,
+                  size: int) -> np.ndarray:
+    """Atlas [size, size, S, 3] of S shots with the texels near [size^2] bool traced anew, where the surface has moved a
+    little since: what all others send there is as it was."""
+    shape = results[0].direct.shape[1:]
+    total = atlas.reshape(size * size, *shape).copy()
+    kept = covered_texels(surface, size)[0]
+    texels = np.concatenate([kept[~near[kept]], *(result.texels for result in results)])
+    source = _nearest_covered(texels, size)
+    albedo = _texel_albedo(surface, size)
+    for _ in range(REFRESHED_BOUNCES):
+        radiosity = (albedo[:, None] * total[source]).reshape(size * size, -1)
+        for result in results:
+            total[result.texels] = result.direct + (result.bounce @ radiosity).reshape(-1, *shape)
+    return total[source].reshape(size, size, *shape)
+
+
+def _texel_albedo(surface: SyntheticSurface, size: int) -> np.ndarray:
+    """[size^2, 3]."""
+    centres = (np.stack(np.meshgrid(np.arange(size), np.arange(size)), -1).reshape(-1, 2) + 0.5) / size
+    return surface.albedo(centres * [1, -1] + [0, 1]).astype(np.float32)
 
 
 def _nearest_covered(texels: np.ndarray, size: int) -> np.ndarray:

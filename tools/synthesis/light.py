@@ -37,6 +37,14 @@ class LampSphere:
         square = np.square(towards).sum(-1)
         return (towards / np.sqrt(square)[..., None]).astype(np.float32), (1.0 / square).astype(np.float32)
 
+    def met_by(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Rays from points [N, 3] mm within the sphere along unit directions [N, 3] -> unit directions [N, 3] in which
+        its centre sees where they meet it."""
+        arm = (points - self.centre) / self.distance_mm
+        along = (arm * directions).sum(1)
+        way = np.sqrt(np.maximum(along**2 + 1.0 - (arm**2).sum(1), 0.0)) - along
+        return arm + way[:, None] * directions
+
 
 class EnvironmentLight:
     """Incident radiance: image [H, 2 H, 3], linear, read bilinearly; directions are in world space. lamps_at: where its
@@ -62,6 +70,10 @@ class EnvironmentLight:
     def smooth_radiance(self, directions: np.ndarray) -> np.ndarray:
         """[..., 3] unit directions -> [..., 3] the light without the excess of its lamps."""
         return self._look_up(self._smooth, directions)
+
+    def lamp_radiance(self, directions: np.ndarray) -> np.ndarray:
+        """[..., 3] unit directions -> [..., 3] the excess of the lamps alone."""
+        return self._look_up(self._lamps, directions)
 
     def lamp_irradiance(self, normals: np.ndarray) -> np.ndarray:
         """[..., 3] unit normals in world space -> [..., 3] irradiance of the lamps when nothing blocks them."""

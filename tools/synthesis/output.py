@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import cv2
@@ -116,6 +116,9 @@ def write_description(folder: Path, camera: PinholeCamera, focal_mm: float, sens
         "color_space": "sRGB, 8 bit; linear radiance 1 = code 255; no tone mapping", "lens_distortion": "none"})
 
 
-def write_poses(path: Path, poses: np.ndarray, camera: PinholeCamera, truth_frames: np.ndarray) -> None:
-    """gt/poses.npz: camera_from_head [F, 4, 4], K [3, 3] and the frames that have buffers."""
-    save_arrays(path, camera_from_head=poses, K=camera.intrinsics, gt_frames=np.asarray(truth_frames, np.int64))
+def write_poses(path: Path, poses: np.ndarray, camera: PinholeCamera, truth_frames: np.ndarray,
+                eyes: Mapping[str, np.ndarray] | None = None) -> None:
+    """gt/poses.npz: camera_from_head [F, 4, 4], K [3, 3], the frames that have buffers, and where the head has living
+    eyes what is true of them."""
+    save_arrays(path, camera_from_head=poses, K=camera.intrinsics, gt_frames=np.asarray(truth_frames, np.int64),
+                **(eyes or {}))

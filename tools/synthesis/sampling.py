@@ -36,6 +36,15 @@ def tangent_frame(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, np.stack([b, sign + y * y * a, -y], -1)
 
 
+def cosine_directions(normals: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Directions [N, K, 3] about unit normals [N, 3], of density cosine / pi, for points [N, K, 2] of the unit square.
+    """
+    ring, around = np.sqrt(points[..., :1]), 2 * np.pi * points[..., 1:]
+    first, second = tangent_frame(normals)
+    sideways = ring * (np.cos(around) * first[:, None] + np.sin(around) * second[:, None])
+    return sideways + np.sqrt(1.0 - points[..., :1]) * normals[:, None]
+
+
 def visible_ggx_normal(outgoing: np.ndarray, alpha: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Microfacet normals [N, 3] in the shading frame (z up), by the distribution of those seen from `outgoing`.
 

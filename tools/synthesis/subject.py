@@ -3,11 +3,12 @@
     python -m tools.synthesize DEST [--preset demo|tiny] [--size 400] [--frames 48] [--light lamp] [--chart] ...
     python -m tools.synthesize DEST --scan SUBJECT --light lamp --clipped 0.25
     python -m tools.synthesize DEST --light lamp --lamp-distance 600
+    python -m tools.synthesize DEST --eyes living --gaze wander --blinks 1
 
 Writes:  DEST/subject.yaml, capture.json, the clip (video.avi, or frames/%04d.png), synthesis.json (how it was made);
          gt/: mesh.obj, albedo.exr, specular.exr, roughness.exr, mask.exr (UV), envmap.exr, poses.npz, where lamps
          stand near lamp.json, and for some frames frames/NNNN_*.exr and .png; relight/: the same head under other
-         lights. tools/score.py reads all of it.
+         lights. tools/score.py reads all of it. poses.npz of living eyes: gaze.true_eyes says what else it holds.
 Method:  a random head of the head model with procedural skin, bumps and bust, or the scan of another subject; a
          procedural light; direct light with its diffuse bounces and the GGX lobe, traced with embree (irradiance,
          camera); sensor noise, 8-bit sRGB.
@@ -38,7 +39,10 @@ from shared.tracking.models import load_head_model
 from tools.synthesis import output
 from tools.synthesis.camera import PictureQuality, PinholeCamera
 from tools.synthesis.chart import place_chart
-from tools.synthesis.head import PITCH_DEG, YAW_DEG, face_part, head_turn, random_head
+from tools.synthesis.eyes import LivingEyes, living_head
+from tools.synthesis.gaze import GAZES, HALF_SHUT, eye_motion, true_eyes
+from tools.synthesis.head import PITCH_DEG, YAW_DEG, Head, face_part, head_turn, random_head
+from tools.synthesis.iris import EyePaint, paint_eyes
 from tools.synthesis.irradiance import IrradianceQuality, SyntheticShot
 from tools.synthesis.light import ENVIRONMENTS, LampSphere, procedural_environment
 from tools.synthesis.render import RenderQuality, Scene, render
@@ -62,6 +66,7 @@ LEAST_IRRADIANCE = 0.8
 as sharp as the pictures."""
 LEAST_LAMP_DISTANCE = 300.0
 """mm from the head's origin: nearer, a lamp would stand among hair and shoulders."""
+LIVING = "living"
 RELIGHT_YAWS_DEG = {"front": 0.0, "left15": -15.0, "right15": 15.0}
 
 
@@ -71,12 +76,13 @@ class SynthesisSettings:
 
     level: subdivisions of the head model. noise: standard deviation of the sensor at full scale. lights: the clip's,
     then those of relight/. truth_frames: how many frames get all buffers. mantissa_bits: precision of the truth on
-    disk. face_truth_only: gt/mesh.obj holds the face without the rest of the head. chart: a colour chart stands beside
-    the head, and the picture is half as wide again to hold it. specular_scale: factor on the specular intensity;
-    0: matte. clipped: share of the face's skin on which a channel burns out, over the clip; 0: the light is as bright
-    as FACE_RADIANCE says. lamp_distance_mm: of the lamps of the clip's light from the head's mean place, where they
-    then give the irradiance that they give far away; 0: they are far away. scan: folder of a subject whose ground truth
-    takes the procedural head's place.
+    disk. eyes: open and closed ones are painted and stand still; living ones turn and blink: gaze and gaze_share as in
+    gaze.eye_motion, blinks_per_second. face_truth_only: gt/mesh.obj holds the face without the rest of the head.
+    chart: a colour chart stands beside the head, and the picture is half as wide again to hold it. specular_scale:
+    factor on the specular intensity; 0: matte. clipped: share of the face's skin on which a channel burns out, over the
+    clip; 0: the light is as bright as FACE_RADIANCE says. lamp_distance_mm: of the lamps of the clip's light from the
+    head's mean place, where they then give the irradiance that they give far away; 0: they are far away. scan: folder
+    of a subject whose ground truth takes the procedural head's place.
     """
 
     size: int = 400
@@ -101,8 +107,19 @@ class SynthesisSettings:
     clipped: float = 0.0
     lamp_distance_mm: float = 0.0
     scan: str | None = None
+    gaze: str = "ahead"
+    gaze_share: float = 1.0
+    blinks_per_second: float = 0.0
     irradiance: IrradianceQuality = IrradianceQuality()
     picture: PictureQuality = PictureQuality()
+
+    def record(self) -> dict:
+        """For synthesis.json: what living eyes do is left out where there are none."""
+        values = asdict(self)
+        if self.eyes != LIVING:
+            for name in ("gaze", "gaze_share", "blinks_per_second"):
+                del values[name]
+        return values
 
 
 PRESETS = {
@@ -118,32 +135,41 @@ def synthesize(destination: Path, settings: SynthesisSettings, processes: int) -
     """Makes the subject in `destination`, which may not hold one yet. Errors: InputError."""
     if (destination / "subject.yaml").exists():
         raise InputError("holds a subject already", where=str(destination), hint="choose another folder or remove it")
-    mesh, true_mesh, materials = scanned(settings) if settings.scan else procedural(settings)
-    materials = replace(materials, specular=settings.specular_scale * materials.specular)
+    eyes = None
+    if settings.eyes == LIVING:
+        head, materials, eyes = living(settings)
+        mesh, true_mesh = head.mesh, face_part(head) if settings.face_truth_only else head.mesh
+    else:
+        mesh, true_mesh, materials = scanned(settings) if settings.scan else procedural(settings)
+        materials = replace(materials, specular=settings.specular_scale * materials.specular)
     lights = tuple(light_of(name, settings) for name in settings.lights)
     distance, height = camera_place(mesh, settings)
     chart = place_chart(distance, height, settings.seed) if settings.chart else None
-    shots = plan_shots(mesh, settings)
+    shots, lids, seen = plan_shots(mesh, settings), (0.0,), {}
+    clip = np.arange(settings.frames)
+    if eyes is not None:
+        shots, lids, seen = with_eyes(shots, head, eyes.eyes, settings)
+        clip = clip[(seen["aperture"] >= HALF_SHUT).all(1)]
     lamps_at = near_lamps(shots[:settings.frames], settings.lamp_distance_mm)
     if settings.clipped:
-        scene = Scene(mesh, materials, lights[:1], lamps_at=lamps_at)
+        scene = Scene(mesh, materials, lights[:1], lamps_at=lamps_at, eyes=eyes, lids=lids)
         gain = burning_gain(scene, shots[:settings.frames], settings, processes)
         lights = (np.float32(gain) * lights[0], *lights[1:])
-    scene = Scene(mesh, materials, lights, chart, lamps_at)
+    scene = Scene(mesh, materials, lights, chart, lamps_at, eyes, lids)
     width = round(WITH_CHART * settings.size) if settings.chart else settings.size
     camera = PinholeCamera(width, settings.size, settings.focal_mm / SENSOR_MM * settings.size)
-    truth = np.unique(np.linspace(0, settings.frames - 1, settings.truth_frames).round().astype(int))
+    truth = clip[np.unique(np.linspace(0, len(clip) - 1, settings.truth_frames).round().astype(int))]
     destination.mkdir(parents=True, exist_ok=True)
     output.write_scene_truth(destination / "gt", scene, true_mesh, settings.mantissa_bits)
     poses = np.stack([shot.camera_from_head for shot in shots[:settings.frames]])
-    output.write_poses(destination / "gt" / "poses.npz", poses, camera, truth)
+    output.write_poses(destination / "gt" / "poses.npz", poses, camera, truth, seen)
     with_buffers = [i in truth or i >= settings.frames for i in range(len(shots))]
     quality = RenderQuality(settings.irradiance, settings.picture, settings.seed)
     pictures = render(scene, shots, camera, quality, with_buffers, processes)
     _write_clip(destination, settings, camera, truth, islice(pictures, settings.frames))
     if len(lights) > 1:
         _write_relight(destination / "relight", settings, scene, shots[settings.frames:], pictures)
-    write_json(destination / "synthesis.json", asdict(settings))
+    write_json(destination / "synthesis.json", settings.record())
     # Last, so that an interrupted run leaves no subject.
     output.write_description(
         destination, camera, focal_mm=settings.focal_mm, sensor_mm=SENSOR_MM * width / settings.size,
@@ -156,6 +182,29 @@ def procedural(settings: SynthesisSettings) -> tuple[Mesh, Mesh, Materials]:
     head = random_head(head_model(settings.level), settings.seed, settings.eyes == "closed")
     materials = SkinPainter(head, settings.texture, settings.seed).paint(Complexion(tone=settings.tone))
     return head.mesh, face_part(head) if settings.face_truth_only else head.mesh, materials
+
+
+def living(settings: SynthesisSettings) -> tuple[Head, Materials, EyePaint]:
+    """As procedural, with living eyes: the head, its textures on which they look ahead, and how they look."""
+    head, eyes = living_head(head_model(settings.level), settings.seed)
+    painter, paint = SkinPainter(head, settings.texture, settings.seed), paint_eyes(eyes, settings.tone, settings.seed)
+    materials = painter.paint(Complexion(tone=settings.tone))
+    materials = replace(materials, specular=settings.specular_scale * materials.specular)
+    return head, paint.on_texture(materials, painter.place, painter.inside("eyes")), paint
+
+
+def with_eyes(shots: list[SyntheticShot], head: Head, eyes: LivingEyes,
+              settings: SynthesisSettings) -> tuple[list[SyntheticShot], tuple[float, ...], dict[str, np.ndarray]]:
+    """The shots with gaze and lids, those after the clip's frames with eyes at rest; the lids' states as of Scene; and
+    what is true of the eyes in the clip."""
+    poses = np.stack([shot.camera_from_head for shot in shots[:settings.frames]])
+    motion = eye_motion(eyes, poses, FPS, settings.seed, settings.gaze, settings.gaze_share,
+                        settings.blinks_per_second, float(eyes.openings(head, 0.0).mean()))
+    lids = (0.0, *sorted(set(motion.lids.tolist()) - {0.0}))
+    clip = [replace(shot, gaze=gaze, lids=lids.index(amount))
+            for shot, gaze, amount in zip(shots, motion.gaze, motion.lids.tolist(), strict=False)]
+    rest = [replace(shot, gaze=np.zeros((2, 2))) for shot in shots[settings.frames:]]
+    return clip + rest, lids, true_eyes(eyes, head, motion)
 
 
 def scanned(settings: SynthesisSettings) -> tuple[Mesh, Mesh, Materials]:
@@ -259,7 +308,12 @@ def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
     parser.add_argument("--size", type=int, help="width and height, pixels")
     parser.add_argument("--frames", type=int, help="length of the clip")
     parser.add_argument("--seed", type=int, help="decides head, skin, light and motion")
-    parser.add_argument("--eyes", choices=("open", "closed"))
+    parser.add_argument("--eyes", choices=("open", "closed", LIVING),
+                        help="living: round eyeballs with iris and cornea, which --gaze and --blinks move")
+    parser.add_argument("--gaze", choices=GAZES, help="of living eyes: ahead of the head (default), into the camera, "
+                        "or wandering over points of the room")
+    parser.add_argument("--gaze-share", type=float, help="how far eyes turn to the camera that look there, 0 to 1")
+    parser.add_argument("--blinks", dest="blinks_per_second", type=float, metavar="PER_SECOND", help="of living eyes")
     parser.add_argument("--tone", type=float, help="melanin: 0.15 fair to 1.6 dark")
     parser.add_argument("--light", choices=ENVIRONMENTS, help="the clip's light")
     parser.add_argument("--focal", dest="focal_mm", type=float, help="focal length, mm, on a sensor 22.3 mm wide")
@@ -279,7 +333,7 @@ def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
     settings = PRESETS[options.preset]
     given = {name: getattr(options, name) for name in
              ("size", "frames", "seed", "eyes", "tone", "noise", "focal_mm", "yaw_deg", "pitch_deg", "specular_scale",
-              "clipped", "lamp_distance_mm", "scan")}
+              "clipped", "lamp_distance_mm", "scan", "gaze", "gaze_share", "blinks_per_second")}
     settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
     settings = replace(settings, chart=options.chart)
     if options.light:
@@ -291,7 +345,8 @@ def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
 def _checked(settings: SynthesisSettings) -> SynthesisSettings:
     for name, low, high in (("size", 64, 2048), ("frames", 8, 1000), ("seed", 0, 10**6), ("tone", 0.05, 2.0),
                             ("noise", 0.0, 0.1), ("focal_mm", 15.0, 500.0), ("yaw_deg", 0.0, 60.0),
-                            ("pitch_deg", 0.0, 40.0), ("specular_scale", 0.0, 2.0), ("clipped", 0.0, 0.9)):
+                            ("pitch_deg", 0.0, 40.0), ("specular_scale", 0.0, 2.0), ("clipped", 0.0, 0.9),
+                            ("gaze_share", 0.0, 1.0), ("blinks_per_second", 0.0, 3.0)):
         value = getattr(settings, name)
         if not low <= value <= high:
             raise InputError("out of range", where=f"--{name.split('_')[0]}", got=value, expected=f"{low} to {high}")
@@ -300,6 +355,11 @@ def _checked(settings: SynthesisSettings) -> SynthesisSettings:
                          expected=f"{LEAST_LAMP_DISTANCE:g} mm or more, or 0: far away")
     if settings.lamp_distance_mm and settings.chart:
         raise InputError("the chart's light is far away", where="--lamp-distance with --chart", hint="leave out one")
+    if settings.eyes != LIVING and (settings.gaze != "ahead" or settings.blinks_per_second):
+        raise InputError("these eyes do not move", where="--gaze or --blinks", got=f"--eyes {settings.eyes}",
+                         hint="add --eyes living")
+    if settings.scan and settings.eyes != SynthesisSettings.eyes:
+        raise InputError("a scan has eyes of its own", where="--scan with --eyes", hint="leave out one")
     if settings.scan and settings.face_truth_only:
         raise InputError("a scan is too large for it", where="--preset tiny", hint="use the preset demo")
     if settings.scan or settings.clipped:
