@@ -11,6 +11,8 @@ Measures: geometry_mm    distance of the true face's points to the result's surf
                          albedo.confident: where maps/confidence.exr, if there is one, is above 0.5
          envmap          through a cosine and a 25 degree lobe, per-channel gain removed
          rerender, relight   sRGB-coded PSNR on the face skin, raw and with one gain per channel
+         gaze, rerender_eyes where the truth has living eyes: degrees between directions, blinks found, and the PSNR on
+                         eyes and lids, of which held_out are frames that the solver did not see
 Frames:  the result's head frame and scale may be any; it is aligned by a similarity transform (camera centres first,
          then trimmed ICP on the face).
 """
@@ -33,7 +35,7 @@ from shared.imaging.color import decode_srgb
 from shared.io.arrays import load_arrays, read_json, write_json
 from shared.io.images import read_exr, read_png
 from shared.io.meshes import read_obj
-from tools.scoring import align, measures
+from tools.scoring import align, gaze, measures
 from tools.scoring.buffers import BufferRenderer
 from tools.scoring.table import table
 
@@ -94,6 +96,8 @@ def score(
     scores["pose_own_alignment"] = measures.pose_errors_own_alignment(true_poses, found_poses)
     chosen = scored_frames(truth["gt_frames"], result, frame_count)
     scores |= score_appearance(subject, result, chosen, alignment.rotation, rng)
+    if "gaze" in truth:
+        scores |= score_eyes(subject, export, truth, alignment.rotation)
     scores |= score_light(subject, export)
     return {"subject": subject.resolve().name, "result": str(export), **scores}
 
@@ -168,6 +172,27 @@ def score_appearance(
         )
     if rendered:
         scores["rerender"] = measures.image_errors(rendered)
+    return scores
+
+
+def score_eyes(subject: Path, export: Path, truth: dict[str, np.ndarray], truth_from_result: np.ndarray) -> dict:
+    """{gaze, rerender_eyes} against what gt/poses.npz says of living eyes; gaze is None where the result has none, and
+    rerender_eyes is left out where it renders no frame that holds truth. truth_from_result [3, 3]."""
+    found = gaze.found_gaze(export)
+    scores: dict = {"gaze": gaze.gaze_errors(truth["gaze"], found, truth_from_result) if found else None}
+    pairs = {}
+    for frame in truth["gt_frames"].tolist():
+        stem, render = subject / "gt" / "frames" / f"{frame:04d}", find_image(export / "renders", f"{frame:04d}")
+        if render is not None:
+            inside = gaze.eye_pixels(read_exr(f"{stem}_depth.exr"), truth["camera_from_head"][frame], truth["K"],
+                                     truth["eyeball_centres"], float(truth["eyeball_radius"]))
+            pairs[frame] = read_exr(f"{stem}_radiance.exr")[inside], read_linear(render)[inside]
+    solve = export.parent / "work" / "inverse_render" / "solve.json"
+    held = [pairs[i] for i in (read_json(solve)["held_out_frames"] if solve.exists() else []) if i in pairs]
+    if pairs:
+        scores["rerender_eyes"] = {"frames": len(pairs), **measures.image_errors(list(pairs.values()))}
+    if held:
+        scores["rerender_eyes"]["held_out"] = {"frames": len(held), **measures.image_errors(held)}
     return scores
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from shared.geometry.eyeballs import SIDES
+
 GAINS = "{psnr:.1f} dB, with gains {psnr_gain:.1f} dB"
 SCALAR = (
     "RMSE {rmse:.3f}, scaled {rmse_scaled:.3f}, correlation {correlation:.2f}, mean {mean_result:.3f} "
@@ -21,7 +23,7 @@ ALBEDO_NAMES = {"aligned": "aligned  ", "aligned_one_gain": "one gain ", "raw": 
 
 def table(scores: dict) -> str:
     """What tools.scoring.score.score returns -> text, one measure a line."""
-    lines = _shape_lines(scores) + _appearance_lines(scores)
+    lines = _shape_lines(scores) + _appearance_lines(scores) + _eye_lines(scores)
     width = max(len(name) for name, _ in lines)
     return "\n".join(f"{name:{width}s}  {text}" for name, text in lines)
 
@@ -50,6 +52,28 @@ def _appearance_lines(scores: dict) -> list[tuple[str, str]]:
     if "rerender" in scores:
         lines.append(("re-render", GAINS.format(**scores["rerender"])))
     return lines + [(f"relight {light}", GAINS.format(**value)) for light, value in scores.get("relight", {}).items()]
+
+
+def _eye_lines(scores: dict) -> list[tuple[str, str]]:
+    lines, gaze = [], scores.get("gaze")
+    if "gaze" in scores and not gaze:
+        lines.append(("gaze", "the result has none"))
+    elif gaze:
+        lines.append(("gaze", _gaze_angles(gaze) if "deg" in gaze else "no open eye in common"))
+        shut = gaze["shut"]
+        found = f"{shut['recall']:.1%} found" if "recall" in shut else "none in the truth"
+        false = f"; {shut['false']:.1%} of open eyes called shut" if "false" in shut else ""
+        lines.append(("blinks", f"{shut['eyes']} shut eyes, {found}{false}; {gaze['frames']} frames"))
+    if "rerender_eyes" in scores:
+        held = scores["rerender_eyes"].get("held_out")
+        text = GAINS.format(**scores["rerender_eyes"]) + f", {scores['rerender_eyes']['frames']} frames"
+        lines.append(("eyes", text + (f"; held out {GAINS.format(**held)}, {held['frames']} frames" if held else "")))
+    return lines
+
+
+def _gaze_angles(gaze: dict) -> str:
+    eyes = ", ".join(f"{side} mean {gaze[side]['mean']:.3g}" for side in SIDES if side in gaze)
+    return f"{_spread(gaze['deg'])} deg ({eyes}), offsets removed {_spread(gaze['deg_centred'])}"
 
 
 def _spread(values: dict[str, float]) -> str:

@@ -1,0 +1,77 @@
+"""How far a result's gaze is from the truth, which blinks it found, and how well it draws the eyes anew.
+
+Gaze is that of shared.geometry.eyeballs: [F, 2, 2] radians, right eye then left, NaN while shut.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from shared.geometry.eyeballs import SIDES, gaze_direction, gaze_towards
+from shared.io.arrays import load_arrays
+from tools.scoring.measures import summary
+
+REGION = (1.1, 0.75)
+"""Half width and half height of the region of an eye, lids and all, in radii of its eyeball."""
+
+
+def found_gaze(export: Path) -> dict[int, np.ndarray]:
+    """{frame: gaze [2, 2]} of a result: of export/poses.npz, or of track_landmarks where that folder lies beside the
+    export and the export has none; empty where neither has."""
+    for path in (export / "poses.npz", export.parent / "work" / "track_landmarks" / "poses.npz"):
+        arrays = load_arrays(path) if path.exists() else {}
+        if "gaze" in arrays:
+            index = arrays.get("frame_index", np.arange(len(arrays["gaze"])))
+            return dict(zip(index.tolist(), arrays["gaze"], strict=True))
+    return {}
+
+
+def gaze_errors(truth: np.ndarray, found: Mapping[int, np.ndarray], truth_from_result: np.ndarray) -> dict:
+    """Angles in degrees between true gaze [F, 2, 2] and that found, where both eyes' lids are open in both: `deg` of
+    all, and of `right` and `left`; `deg_centred` after one constant offset in yaw and pitch of each eye. `shut`: of
+    blinks, how many eyes are shut in the frames compared, which share of them was found (`recall`; left out where none
+    is shut), and which share of open ones was said to be shut (`false`). Angles are left out where no eye is open.
+
+    truth_from_result [3, 3] turns the result's head space into the truth's.
+    """
+    frames = [frame for frame in sorted(found) if frame < len(truth)]
+    true, seen = truth[frames], np.array([found[frame] for frame in frames]).reshape(-1, 2, 2)
+    seen = gaze_towards(gaze_direction(seen) @ truth_from_result.T)
+    shut, said = np.isnan(true).any(-1), np.isnan(seen).any(-1)
+    scores: dict = {"frames": len(frames), "shut": {"eyes": int(shut.sum())}}
+    if shut.any():
+        scores["shut"]["recall"] = float(said[shut].mean())
+    if not shut.all():
+        scores["shut"]["false"] = float(said[~shut].mean())
+    both = ~shut & ~said
+    if not both.any():
+        return scores
+    centred = seen.copy()
+    for eye, name in enumerate(SIDES):
+        own = both[:, eye]
+        if own.any():
+            centred[own, eye] -= (seen[own, eye] - true[own, eye]).mean(0)
+            scores[name] = summary(_apart_deg(true[own, eye], seen[own, eye]))
+    return scores | {"deg": summary(_apart_deg(true[both], seen[both])),
+                     "deg_centred": summary(_apart_deg(true[both], centred[both]))}
+
+
+def _apart_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """[N, 2] pairs -> [N] degrees, accurate for small angles."""
+    chord = np.linalg.norm(gaze_direction(first) - gaze_direction(second), axis=-1)
+    return np.degrees(2.0 * np.arcsin(np.clip(0.5 * chord, 0.0, 1.0)))
+
+
+def eye_pixels(depth: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray, centres: np.ndarray,
+               radius: float) -> np.ndarray:
+    """[H, W] bool: pixels that show an eye with its lids; depth [H, W] mm of the true surface, 0 beside it;
+    camera_from_head [4, 4], intrinsics [3, 3]; centres [2, 3] and radius of the eyeballs, mm."""
+    row, column = np.indices(depth.shape)
+    rays = (np.stack([column, row], -1) + 0.5 - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]]
+    place = np.concatenate([rays, np.ones((*depth.shape, 1))], -1) * depth[..., None]
+    arm = ((place - camera_from_head[:3, 3]) @ camera_from_head[:3, :3])[..., None, :] - centres
+    off = (arm[..., :2] / (radius * np.array(REGION))) ** 2
+    return (depth > 0) & ((off.sum(-1) < 1.0) & (arm[..., 2] > 0)).any(-1)
