@@ -21,6 +21,7 @@ REFERENCES = {
     "Bradski2000": "Bradski, The OpenCV Library. Dr. Dobb's Journal of Software Tools, 2000.",
     "Breiman1984": "Breiman et al., Classification and Regression Trees. Wadsworth, 1984.",
     "Burley2012": "Burley, Physically-Based Shading at Disney. SIGGRAPH courses, 2012.",
+    "Carpenter1988": "Carpenter, Movements of the Eyes. Pion, 1988.",
     "Chen1992":
         "Chen, Medioni, Object modelling by registration of multiple range images. Image and Vision Computing 10, "
         "1992.",

@@ -17,7 +17,7 @@ from tools.bench.runner import Table, run
 from tools.bench.stress.bench import StressBench, missing_cases, verdicts
 from tools.bench.stress.camera import Sensor, compressed, defocused, drift, photograph, shaken, smeared
 from tools.bench.stress.perturbations import PERTURBATIONS, Perturbation, StressCase
-from tools.bench.stress.scenes import StressScene, expressions_of, smile_of
+from tools.bench.stress.scenes import SETTINGS, StressScene, expressions_of, living_plan, smile_of
 from tools.bench.stress.subject import mirror_truth, sliding_landmarks, wrong_poses
 from tools.bench.stress.verdict import FAILED, LIMITS, RIGHT, SAID, SILENT, WARNED, judge
 from tools.synthesis.head import head_turn
@@ -155,6 +155,22 @@ def test_speech_goes_on_and_comes_back_to_closed_lips():
     assert actions["jaw_open"] > 0 and amount.max() == 0.5
     assert np.diff(np.nonzero(amount == 0)[0]).max() < 8 and (amount == 0).sum() >= 5
     assert len(set(amount)) <= 5, "each opening is a head of its own"
+
+
+def test_eyes_hold_the_camera_by_the_share_of_the_turn_and_blink_as_often_as_said():
+    half, whole = (living_plan(StressScene(gaze=share, frames=8)) for share in (0.5, 1.0))
+    assert np.abs(whole.eyes["gaze"][..., 0]).max() > np.radians(20.0)
+    assert np.allclose(half.eyes["gaze"], 0.5 * whole.eyes["gaze"]) and len(half.truth) == SETTINGS.truth_frames
+    blinking = living_plan(StressScene(blink=1.0, frames=48))
+    shut = np.isnan(blinking.eyes["gaze"][:, 0, 0])
+    assert (np.diff(shut.astype(int)) == 1).sum() == 2 and not shut[blinking.truth].any()
+    assert np.array_equal(blinking.eyes["gaze"][~shut], np.zeros(((~shut).sum(), 2, 2)))
+
+
+def test_scenes_rendered_before_there_were_moving_eyes_are_still_known():
+    assert "gaze" not in StressScene().content and StressScene(gaze=0.5).content["gaze"] == 0.5
+    assert len({StressScene().name, StressScene(gaze=0.5).name, StressScene(blink=1.0).name}) == 3
+    assert StressScene().settings.eyes == "open" and StressScene(blink=1.0).settings.eyes == "living"
 
 
 def row(exit_code=0, warnings=(), missed=(), **worse):

@@ -40,7 +40,8 @@ class StressCase:
     @property
     def digest(self) -> str:
         """Of all that decides the subject."""
-        content = [[[scene.name, gain] for scene, gain in self.mix], asdict(self)]
+        whole = asdict(self) | {"mix": [[scene.content, gain] for scene, gain in self.mix]}
+        content = [[[scene.name, gain] for scene, gain in self.mix], whole]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -117,6 +118,10 @@ PERTURBATIONS = (
                  lambda s: _seen(long_smile=s), r"expression|mouth|do not fit"),
     Perturbation("speech", "someone who speaks", "how far the lips part", (0.5, 1.0),
                  lambda s: _seen(speech=s), r"expression|mouth|do not fit"),
+    Perturbation("gaze", "eyes that hold the camera while the head turns", "share of the turn", (0.5, 1.0),
+                 lambda s: _seen(gaze=s), r"gaze|eyes"),
+    Perturbation("blink", "someone who blinks", "blinks per second", (1.0, 2.0),
+                 lambda s: _seen(blink=s), r"blink|eyes"),
     Perturbation("wrong_focal", "a focal length given too long", "log of stated over true", (0.1, 0.3, math.log(3.0)),
                  lambda s: StressCase(focal_gain=math.exp(s)), r"focal"),
     Perturbation("short_focal", "a focal length given too short", "log of true over stated", (0.3, math.log(3.0)),

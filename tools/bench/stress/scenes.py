@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +18,23 @@ from shared.io.arrays import save_arrays
 from shared.rendering.envmap import latlong_directions
 from tools.synthesis import output
 from tools.synthesis.camera import PictureQuality, PinholeCamera
+from tools.synthesis.gaze import HALF_SHUT
 from tools.synthesis.head import Head, random_head
-from tools.synthesis.irradiance import IrradianceQuality
+from tools.synthesis.irradiance import IrradianceQuality, SyntheticShot
 from tools.synthesis.makeup import made_up, sweaty
 from tools.synthesis.render import RenderQuality, Scene, render
 from tools.synthesis.skin import Complexion, SkinPainter
-from tools.synthesis.subject import SENSOR_MM, SynthesisSettings, head_model, light_of, near_lamps, plan_shots
+from tools.synthesis.subject import (
+    LIVING,
+    SENSOR_MM,
+    SynthesisSettings,
+    head_model,
+    light_of,
+    living,
+    near_lamps,
+    plan_shots,
+    with_eyes,
+)
 from tools.synthesis.surface import Materials
 from tools.synthesis.wear import coloured, with_beard, with_fringe, with_glasses
 
@@ -51,7 +62,9 @@ class StressScene:
     how coloured the two sides are, 0 to 1.
 
     tone: melanin; makeup, wet, fringe: shares; glasses_mm, beard_mm: thickness; smile: what comes and goes mid-clip;
-    long_smile: the same for almost half of it; speech: how far lips move in all of it.
+    long_smile: the same for almost half of it; speech: how far lips move in all of it. gaze: share of the head's turn
+    by which the eyes turn back to hold the camera; blink: how often they blink, per second; where either is not 0 they
+    are living eyes, which wear nothing and show no expression.
     """
 
     light: str = "room"
@@ -67,6 +80,8 @@ class StressScene:
     smile: float = 0.0
     long_smile: float = 0.0
     speech: float = 0.0
+    gaze: float = 0.0
+    blink: float = 0.0
     yaw_deg: float = SETTINGS.yaw_deg
     pitch_deg: float = SETTINGS.pitch_deg
     frames: int = SETTINGS.frames
@@ -77,15 +92,27 @@ class StressScene:
         """What differs from the defaults, and a digest of everything that decides the pictures."""
         changed = [f"{f.name}{getattr(self, f.name):g}" if not isinstance(getattr(self, f.name), str)
                    else getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default]
-        content = json.dumps([asdict(self), RECIPE], sort_keys=True)
+        content = json.dumps([self.content, RECIPE], sort_keys=True)
         return "_".join([*changed, hashlib.sha256(content.encode()).hexdigest()[:8]])
+
+    @property
+    def content(self) -> dict:
+        """Of a digest. Without what later versions added, where it is not used: what was rendered before stays."""
+        return {name: value for name, value in asdict(self).items() if value or name not in ("gaze", "blink")}
+
+    @property
+    def living(self) -> bool:
+        """Do the eyes move?"""
+        return bool(self.gaze or self.blink)
 
     @property
     def settings(self) -> SynthesisSettings:
         """Of the synthesiser; sharp highlights need more samples."""
         quality = SETTINGS.picture if not self.wet else replace(SETTINGS.picture, lobe_samples=4, lamp_samples=8)
         return replace(SETTINGS, frames=self.frames, yaw_deg=self.yaw_deg, pitch_deg=self.pitch_deg, tone=self.tone,
-                       lights=(self.light,), seed=self.seed, picture=quality)
+                       lights=(self.light,), seed=self.seed, picture=quality,
+                       **({"eyes": LIVING, "gaze": "camera", "gaze_share": self.gaze, "blinks_per_second": self.blink}
+                          if self.living else {}))
 
 
 def camera() -> PinholeCamera:
@@ -98,31 +125,62 @@ def render_scene(scene: StressScene, folder: Path, processes: int = 1) -> Path:
     done = folder / scene.name
     if (done / "radiance.npy").exists():
         return done
-    settings, truth, states, light = scene.settings, _truth_frames(scene), list(_states(scene)), _light(scene)
-    shots = plan_shots(states[0][0].mesh, settings)
-    if scene.on_head:
-        shots = [replace(shot, world_from_head=np.eye(3)) for shot in shots]
-    lamps_at = near_lamps(shots, scene.lamp_mm)
+    settings, plan = scene.settings, living_plan(scene) if scene.living else _plan(scene)
+    shots, truth = plan.shots, plan.truth
     (done / "gt").mkdir(parents=True, exist_ok=True)
+    output.write_scene_truth(done / "gt", plan.states[0][0], plan.states[0][0].mesh, 10)
     pictures: list[np.ndarray | None] = [None] * scene.frames
-    for number, (head, materials, index) in enumerate(states):
-        scene = Scene(head.mesh, materials, (light,), lamps_at=lamps_at)
-        if number == 0:
-            output.write_scene_truth(done / "gt", scene, head.mesh, 10)
+    for state, index in plan.states:
         quality = RenderQuality(settings.irradiance, settings.picture, settings.seed)
         chosen = [shots[i] for i in index]
         wanted = [i in truth for i in index]
-        for i, images in zip(index, render(scene, chosen, camera(), quality, wanted, processes), strict=True):
+        for i, images in zip(index, render(state, chosen, camera(), quality, wanted, processes), strict=True):
             pictures[i] = images["radiance"]
             if i in truth:
                 output.write_buffers(str(done / "gt" / "frames" / f"{i:04d}"), images, images, 10)
     poses = np.stack([shot.camera_from_head for shot in shots])
-    output.write_poses(done / "gt" / "poses.npz", poses, camera(), truth)
-    save_arrays(done / "landmarks.npz", points_head=states[0][0].landmarks())
+    output.write_poses(done / "gt" / "poses.npz", poses, camera(), truth, plan.eyes)
+    save_arrays(done / "landmarks.npz", points_head=plan.landmarks)
     temporary = done / "radiance.tmp.npy"
     np.save(temporary, np.stack(pictures).astype(np.float16))
     temporary.rename(done / "radiance.npy")
     return done
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePlan:
+    """What is to be rendered: states, each with the frames that show it, the neutral one first; all frames' shots; the
+    frames that get buffers; landmarks [468, 3] mm; what is true of living eyes."""
+
+    states: list[tuple[Scene, list[int]]]
+    shots: list[SyntheticShot]
+    truth: np.ndarray
+    landmarks: np.ndarray
+    eyes: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def _plan(scene: StressScene) -> ScenePlan:
+    """A scene of its own for each strength of the expression."""
+    states, light = list(_states(scene)), _light(scene)
+    shots = _shots(scene, states[0][0])
+    lamps_at = near_lamps(shots, scene.lamp_mm)
+    lit = [(Scene(head.mesh, materials, (light,), lamps_at=lamps_at), index) for head, materials, index in states]
+    still = np.nonzero(expressions_of(scene)[1] == 0)[0]
+    return ScenePlan(lit, shots, _truth_frames(still), states[0][0].landmarks())
+
+
+def living_plan(scene: StressScene) -> ScenePlan:
+    """Of a scene whose eyes and lids move: one state, whose shots have the gaze."""
+    head, materials, eyes = living(scene.settings)
+    shots, lids, seen = with_eyes(_shots(scene, head), head, eyes.eyes, scene.settings)
+    lit = Scene(head.mesh, materials, (_light(scene),), lamps_at=near_lamps(shots, scene.lamp_mm), eyes=eyes, lids=lids)
+    opened = np.nonzero((seen["aperture"] >= HALF_SHUT).all(1))[0]
+    return ScenePlan([(lit, list(range(scene.frames)))], shots, _truth_frames(opened), head.landmarks(), seen)
+
+
+def _shots(scene: StressScene, head: Head) -> list[SyntheticShot]:
+    shots = plan_shots(head.mesh, scene.settings)
+    return [replace(shot, world_from_head=np.eye(3)) for shot in shots] if scene.on_head else shots
 
 
 def expressions_of(scene: StressScene) -> tuple[dict[str, float], np.ndarray]:
@@ -147,9 +205,8 @@ def opening_of(frames: int) -> np.ndarray:
     return np.round(OPENINGS * np.maximum(1.5 * syllable - 0.5, 0.0)) / OPENINGS
 
 
-def _truth_frames(scene: StressScene) -> np.ndarray:
-    """Frames that get buffers, evenly spread over those with the face that the mesh has."""
-    still = np.nonzero(expressions_of(scene)[1] == 0)[0]
+def _truth_frames(still: np.ndarray) -> np.ndarray:
+    """Frames that get buffers, evenly spread over those with the face that the mesh has, still [N]."""
     return still[np.unique(np.linspace(0, len(still) - 1, SETTINGS.truth_frames).round().astype(int))]
 
 

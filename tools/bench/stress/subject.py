@@ -81,8 +81,10 @@ def _write_truth(folder: Path, parts: list[tuple[Path, float]], kept: np.ndarray
     for frame in known:
         for file in (source / "frames").glob(f"{frame:04d}_*"):
             (folder / "frames" / f"{numbers[frame]:04d}_{file.name[5:]}").symlink_to(file.resolve())
+    eyes = {name: truth[name][kept] if name in ("gaze", "aperture") else truth[name] for name in truth
+            if name not in ("camera_from_head", "K", "gt_frames")}
     save_arrays(folder / "poses.npz", camera_from_head=poses[kept], K=truth["K"],
-                gt_frames=np.array([numbers[frame] for frame in known], np.int64))
+                gt_frames=np.array([numbers[frame] for frame in known], np.int64), **eyes)
     still = [(path, gain) for path, gain in parts if not path.name.startswith("cap")]
     light = sum(gain * read_exr(path / "gt" / "envmap.exr") for path, gain in still)
     output.write_environment(folder / "envmap.exr", light)
