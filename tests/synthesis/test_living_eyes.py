@@ -34,6 +34,7 @@ from tools.synthesis.irradiance import (
     refresh_atlas,
 )
 from tools.synthesis.light import EnvironmentLight, LampSphere
+from tools.synthesis.lips import slit_mm, with_shut_lips
 from tools.synthesis.subject import PRESETS, head_model, main, synthesize
 from tools.synthesis.surface import Materials, ShadingPoints, SyntheticSurface
 
@@ -266,6 +267,17 @@ def test_eyes_that_cannot_move_are_refused(tmp_path, capsys):
     assert "add --eyes living" in capsys.readouterr().err
     assert main([str(tmp_path / "new"), "--eyes", "living", "--blinks", "9"]) == 2
     assert "out of range" in capsys.readouterr().err and not (tmp_path / "new").exists()
+
+
+def test_lips_that_leave_a_slit_are_shut_and_nothing_else_moves(made):
+    head, eyes = made
+    shut = with_shut_lips(head)
+    assert slit_mm(head) > 10.0 and slit_mm(shut) <= 3.0
+    moved = np.abs(shut.mesh.vertices - head.mesh.vertices)
+    assert 0.1 < moved[:, 1].max() < 3.0 and moved[:, [0, 2]].max() == 0.0
+    own = np.unique(head.mesh.faces[np.isin(head.face_segment, [head.segment_names.index(name) for name in
+                                                                ("eyes", "lids", "brows", "forehead", "ears")])])
+    assert moved[own].max() == 0.0
 
 
 def test_a_sphere_is_fitted_to_the_round_eyeballs(made):

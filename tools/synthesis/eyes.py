@@ -30,8 +30,6 @@ AT_REST = 0.05
 """Activation of the blink that lids at rest already have (head.random_head)."""
 OPEN = 0.45
 """Activation of the model's wide eyes in lids at rest: its own hide the upper half of an iris that looks ahead."""
-PRESSED = 0.3
-"""Activation that presses the lips together, which on some heads leave a slit."""
 WIDE_PER_AMOUNT = 2.3
 """Activations of the model's wide eyes that raise the upper lid as far as one blink lowers it."""
 SHUT_STEPS = 9
@@ -103,8 +101,8 @@ class LivingEyes:
 
 
 def living_head(model: HeadModel, seed: int) -> tuple[Head, LivingEyes]:
-    """The head that random_head makes, with open eyes, round eyeballs, the lids kept about them, and shut lips."""
-    head = random_head(model, seed, eyes_closed=False, extra=dict.fromkeys(WIDE, OPEN) | {"mouth_press": PRESSED})
+    """The head that random_head makes, with open eyes, round eyeballs and the lids kept about them."""
+    head = random_head(model, seed, eyes_closed=False, extra=dict.fromkeys(WIDE, OPEN))
     rng = np.random.default_rng([seed, 10])
     size, depth = 1.0 + RADIUS_SPREAD * rng.uniform(-1, 1), DEPTH_SPREAD_MM * rng.uniform(-1, 1)
     eyes = head.face_segment == head.segment_names.index("eyes")

@@ -45,6 +45,7 @@ from tools.synthesis.head import PITCH_DEG, YAW_DEG, Head, face_part, head_turn,
 from tools.synthesis.iris import EyePaint, paint_eyes
 from tools.synthesis.irradiance import IrradianceQuality, SyntheticShot
 from tools.synthesis.light import ENVIRONMENTS, LampSphere, procedural_environment
+from tools.synthesis.lips import with_shut_lips
 from tools.synthesis.render import RenderQuality, Scene, render
 from tools.synthesis.scan import read_scan
 from tools.synthesis.skin import Complexion, SkinPainter
@@ -185,8 +186,10 @@ def procedural(settings: SynthesisSettings) -> tuple[Mesh, Mesh, Materials]:
 
 
 def living(settings: SynthesisSettings) -> tuple[Head, Materials, EyePaint]:
-    """As procedural, with living eyes: the head, its textures on which they look ahead, and how they look."""
+    """As procedural, with living eyes and shut lips: the head, its textures on which the eyes look ahead, and how they
+    look."""
     head, eyes = living_head(head_model(settings.level), settings.seed)
+    head = with_shut_lips(head)
     painter, paint = SkinPainter(head, settings.texture, settings.seed), paint_eyes(eyes, settings.tone, settings.seed)
     materials = painter.paint(Complexion(tone=settings.tone))
     materials = replace(materials, specular=settings.specular_scale * materials.specular)
