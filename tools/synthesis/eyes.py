@@ -34,6 +34,8 @@ WIDE_PER_AMOUNT = 2.3
 """Activations of the model's wide eyes that raise the upper lid as far as one blink lowers it."""
 SHUT_STEPS = 9
 """Halvings that find where lids meet."""
+SLOPES = ((0.0, 0.0), (-0.5, 0.0), (0.5, 0.0), (0.0, -0.25), (0.0, 0.25))
+"""Sideways and up: ways of rays that may not meet an eyeball which is shut."""
 COLUMNS_MM, STEP_MM, BEFORE_MM = (-2.0, -1.0, 0.0, 1.0, 2.0), 0.1, 300.0
 """Beside the centre of an eyeball: where the opening of the lids is measured; between rays; where they start."""
 
@@ -80,10 +82,11 @@ class LivingEyes:
                          for side in range(len(SIDES))])
 
     def shown(self, head: Head, amount: float) -> int:
-        """How many rays of a fixed grid from the front meet an eyeball."""
+        """How many rays of fixed grids, from the front and askew, meet an eyeball."""
         faces, scene = self._before(head, amount)
-        grid = np.arange(-self.radius, self.radius, 2 * STEP_MM)
-        return sum(int(self._seen(scene, faces, side, grid, grid).sum()) for side in range(len(SIDES)))
+        grid = np.arange(-self.radius, self.radius, 3 * STEP_MM)
+        return sum(int(self._seen(scene, faces, side, grid, grid, slope).sum())
+                   for side in range(len(SIDES)) for slope in SLOPES)
 
     def _before(self, head: Head, amount: float) -> tuple[np.ndarray, RayScene]:
         """Faces [N] about the eyes, and what rays meet of them."""
@@ -92,11 +95,15 @@ class LivingEyes:
         faces = np.nonzero(near[head.mesh.faces].any(1))[0]
         return faces, RayScene(vertices, head.mesh.faces[faces])
 
-    def _seen(self, scene: RayScene, faces: np.ndarray, side: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """[N] bool: rays from the front beside the eyeball's centre at all x [K] and y [L] that meet it first."""
+    def _seen(self, scene: RayScene, faces: np.ndarray, side: int, x: np.ndarray, y: np.ndarray,
+              slope: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+        """[N] bool: rays beside the eyeball's front at all x [K] and y [L] that meet it first; slope: of their ways
+        sideways and up."""
         grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-        origins = self.centres[side] + np.column_stack([grid, np.full(len(grid), BEFORE_MM)])
-        face, _, _ = scene.intersect(origins.astype(np.float32), np.tile(np.float32([0, 0, -1]), (len(grid), 1)))
+        front = self.centres[side] + np.column_stack([grid, np.full(len(grid), self.radius)])
+        towards = np.array([*slope, -1.0])
+        origins = (front - BEFORE_MM * towards).astype(np.float32)
+        face, _, _ = scene.intersect(origins, np.tile(towards.astype(np.float32), (len(grid), 1)))
         return (face >= 0) & (self.face_side[faces[face]] == side)
 
 
@@ -167,7 +174,7 @@ def _rounded(vertices: np.ndarray, oval: list[_Oval], centres: np.ndarray, radiu
 
 
 def _meeting(eyes: LivingEyes, head: Head) -> float:
-    """The share of a whole blink at which lids hide the eyeballs from the front."""
+    """The share of a whole blink at which lids hide the eyeballs."""
     low, high = 0.0, 1.0
     for _ in range(SHUT_STEPS):
         middle = 0.5 * (low + high)
