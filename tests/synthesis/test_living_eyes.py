@@ -14,6 +14,7 @@ from shared.io.arrays import load_arrays, read_json
 from shared.rendering import brdf
 from shared.rendering.envmap import latlong_directions
 from tools.synthesis.camera import PictureQuality
+from tools.synthesis.eye_light import eye_irradiance
 from tools.synthesis.eyes import DEPTH_SPREAD_MM, RADIUS_SPREAD, living_head
 from tools.synthesis.gaze import HALF_SHUT, EyeMotion, blink_curve, eye_motion, towards_camera, true_eyes, wandering
 from tools.synthesis.head import Head, head_turn, random_head
@@ -177,6 +178,11 @@ def test_the_cornea_mirrors_like_a_sphere_of_its_own_radius(made, paint):
 class Empty:
     """Nothing is in the way."""
 
+    class scene:
+        @staticmethod
+        def occluded(origins, directions):
+            return np.zeros(len(origins), bool)
+
     @staticmethod
     def hits(origins, directions):
         return np.zeros(0, int), np.zeros((0, 2)), np.ones(len(directions), bool)
@@ -222,6 +228,23 @@ def test_a_near_lamp_is_mirrored_from_where_it_stands():
     expected = brdf.schlick_fresnel(np.cos(angle)) * 50.0
     np.testing.assert_allclose(mirrored(light, half, outgoing, lamps, place), expected, rtol=0.03)
     assert mirrored(light, towards + outgoing, outgoing, lamps, place).max() < 0.1 * expected
+
+
+@pytest.mark.parametrize("near_mm", [0.0, 400.0])
+def test_unshaded_eyes_receive_what_the_light_sends(near_mm):
+    """The sum over the map's texels. A lamp however near sends the same to a point that lies in its centre."""
+    lamps = LampSphere(np.zeros(3), near_mm) if near_mm else None
+    image = sunny([1.0, 0.0, 1.0], 6.0)
+    light = EnvironmentLight(image, lamps)
+    pose = np.eye(4)
+    shot = SyntheticShot(pose, np.eye(3), 0, 1)
+    normal = np.tile(np.float32([0.0, 0.0, 1.0]), (400, 1))
+    points = ShadingPoints(np.zeros((400, 3), np.float32), normal, normal, np.zeros((400, 2), np.float32))
+    found = eye_irradiance(Empty, light, np.zeros((4, 4, 3), np.float32), shot, points, np.random.default_rng(0))
+    directions = latlong_directions(128)
+    solid_angle = np.sqrt(1.0 - directions[..., 1] ** 2) * (np.pi / 128) ** 2
+    expected = (image[..., 0] * np.maximum(directions[..., 2], 0.0) * solid_angle).sum()
+    np.testing.assert_allclose(found.mean(0), expected, rtol=0.02)
 
 
 def test_light_traced_anew_where_nothing_moved_is_the_light_that_was(made, paint):
