@@ -23,7 +23,7 @@ from shared.errors import LimnError
 
 STAGE = Stage(
     name="export_usd",
-    version=5,
+    version=6,
     help="The head as USD, glTF, OBJ and EXR, with a report to judge it by.",
     inputs=("sample_frames", "track_landmarks", "init_albedo", "inverse_render"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -95,7 +95,7 @@ def read_eyes(job: Job, mesh, poses: dict) -> tuple:
     from shared.io.arrays import load_arrays, read_json
 
     segment = load_arrays(job.input("inverse_render") / "mesh.npz").get("face_segment")
-    if "gaze" not in poses or segment is None:
+    if "eye_turn" not in poses or segment is None:
         return ()
     names = read_json(job.input("track_landmarks") / "tracking.json")["segments"]
     return eyeballs_of(Surface(mesh, segment, tuple(names))) or ()
@@ -129,7 +129,7 @@ def describe_capture(job: Job, poses: dict, frames):
     return UsdCapture(poses["camera_from_head"], poses["frame_index"], fps=frames.fps, intrinsics=intrinsics,
                       width=width,
                       height=height, moves=frames.moves, film_width_mm=film_width,
-                      light_with_camera=light_moves(job, frames.moves) != frames.moves, gaze=poses.get("gaze"))
+                      light_with_camera=light_moves(job, frames.moves) != frames.moves, eye_turn=poses.get("eye_turn"))
 
 
 def near_lamp(solve: dict):
@@ -331,7 +331,6 @@ def run(job: Job) -> None:
     eyes = read_eyes(job, mesh, poses)
     asset = describe_asset(job, mesh, eyes, describe_capture(job, poses, frames), frames, writer, lamp)
     write_assets(job, asset, poses, maps, far)
-    eyes = read_eyes(job, mesh, poses)
     views = render_views(job, writer, mesh, eyes, maps, envmap, poses, frames, solve)
     record = run_record(job, mesh, solve, time.perf_counter() - start)
     write_json(job.out / "run.json", record)

@@ -70,19 +70,14 @@ FRAMES = (
 
 COVARIANCE = Field("covariance", "Covariance of each pose: rotation (radians), then translation (mm).", "float64",
                    "F, 6, 6")
-GAZE = (
-    Field("gaze", "Where the right and the left eye look: yaw towards +x and pitch towards +y in head space, 0 "
-          "straight ahead; NaN while shut or not seen. Absent with `eyes=false`.", "float64", "F, 2, 2", "radians",
-          optional=True),
-    Field("gaze_sigma", "Its standard deviation.", "float64", "F, 2, 2", "radians", optional=True),
-)
 TRACKED_POSES = (
     POSES,
     COVARIANCE,
     FRAME_INDEX,
     SOURCE_LENS,
     CROP_LENS,
-    *GAZE,
+    GAZE,
+    Field("gaze_sigma", "Its standard deviation.", "float64", "F, 2, 2", "rad", optional=True),
 )
 MESH = (
     Field("vertices", "Positions in head space.", "float64", "V, 3", "mm"),
@@ -181,8 +176,7 @@ INIT = (
     Field("seen_share", "Share of the head's texels that the frames show."),
 )
 
-SOLVED_POSES = (POSES, replace(COVARIANCE, optional=True), FRAME_INDEX, SOURCE_LENS, CROP_LENS, GAZE,
-                EYE_TURN)
+SOLVED_POSES = (POSES, replace(COVARIANCE, optional=True), FRAME_INDEX, SOURCE_LENS, CROP_LENS, GAZE, EYE_TURN)
 _REFERENCE = "solver=reference only:"
 _CANDIDATES = (
     Field("part", "Part of the model.", "text"),

@@ -40,8 +40,9 @@ class UsdCapture:
     height frame.
 
     moves: "head" or "camera", what turned while the light stood still. film_width_mm: width of the sensor
-    that the full frame shows. light_with_camera: the camera moved and carried the light along. gaze [F, 2, 2]: of the
-    right and the left eye, NaN while shut; None where it was not solved.
+    that the full frame shows. light_with_camera: the camera moved and carried the light along. eye_turn [F, 2, 2]
+    radians: how the right and the left eyeball are turned (shared/geometry/eyeballs.py), NaN while shut; None where it
+    is not known.
     """
 
     camera_from_head: np.ndarray
@@ -53,7 +54,7 @@ class UsdCapture:
     moves: str
     film_width_mm: float = DEFAULT_FILM_WIDTH_MM
     light_with_camera: bool = False
-    gaze: np.ndarray | None = None
+    eye_turn: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -111,13 +112,13 @@ def world_from_head_rigid(capture: UsdCapture) -> np.ndarray:
 
 
 def eye_turns(capture: UsdCapture, eye: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frames [n] in which an eye (0 right, 1 left) is open, and the rotations [n, 3, 3] of its gaze from straight
-    ahead. Who plays them turns evenly from one such frame to the next, also through a blink, and holds the first and
+    """Frames [n] in which an eye (0 right, 1 left) is open, and the rotations [n, 3, 3] from straight ahead.
+    Who plays them turns evenly from one such frame to the next, also through a blink, and holds the first and
     the last."""
-    if capture.gaze is None:
+    if capture.eye_turn is None:
         return np.zeros(0, int), np.zeros((0, 3, 3))
-    known = np.isfinite(capture.gaze[:, eye]).all(-1)
-    return np.asarray(capture.frame_index)[known], gaze_rotation(capture.gaze[known, eye])
+    known = np.isfinite(capture.eye_turn[:, eye]).all(-1)
+    return np.asarray(capture.frame_index)[known], gaze_rotation(capture.eye_turn[known, eye])
 
 
 def animate(prim: UsdGeom.Xformable, world_from_local: np.ndarray, time_codes: np.ndarray) -> None:

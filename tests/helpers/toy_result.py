@@ -151,7 +151,7 @@ def _write_eyes(folder: Path) -> None:
     surface = toy_eyed_surface()
     save_mesh(folder / "mesh.npz", surface.mesh, face_segment=surface.face_segment)
     poses = {"camera_from_head": toy_poses(), "frame_index": FRAMES, "intrinsics": INTRINSICS}
-    save_arrays(folder / "poses.npz", **poses, gaze=toy_gaze())
+    save_arrays(folder / "poses.npz", **poses, gaze=toy_gaze(), eye_turn=toy_gaze())
 
 
 class ToyJob:

@@ -159,7 +159,7 @@ def eye_rotations(content, binary, node):
 @pytest.fixture
 def eyed(tmp_path, moves):
     surface = toy_eyed_surface()
-    write_glb(tmp_path / "eyes.glb", NAME, surface.mesh, toy_maps(), replace(capture(moves), gaze=toy_gaze()),
+    write_glb(tmp_path / "eyes.glb", NAME, surface.mesh, toy_maps(), replace(capture(moves), eye_turn=toy_gaze()),
               eyeballs_of(surface))
     return tmp_path / "eyes.glb"
 

@@ -139,7 +139,7 @@ def test_eyes_whose_gaze_is_not_known_stay_in_the_head(tmp_path):
     """Without a gaze, the mesh with eyes is exported as one."""
     work = write_toy_work(tmp_path / "work", eyes=True)
     poses = load_arrays(work / "inverse_render" / "poses.npz")
-    del poses["gaze"]
+    del poses["gaze"], poses["eye_turn"]
     save_arrays(work / "inverse_render" / "poses.npz", **poses)
     job = ToyJob(work, tmp_path / "export", usdz=False, glb=False, plates=False, views=False)
     export_usd.run(job)
@@ -155,7 +155,8 @@ def test_eyes_whose_gaze_is_not_known_stay_in_the_head(tmp_path):
 def test_eyes_that_never_open_look_straight_ahead(tmp_path):
     work = write_toy_work(tmp_path / "work", eyes=True)
     poses = load_arrays(work / "inverse_render" / "poses.npz")
-    save_arrays(work / "inverse_render" / "poses.npz", **poses | {"gaze": np.full_like(poses["gaze"], np.nan)})
+    shut = dict.fromkeys(("gaze", "eye_turn"), np.full_like(poses["gaze"], np.nan))
+    save_arrays(work / "inverse_render" / "poses.npz", **poses | shut)
     job = ToyJob(work, tmp_path / "export", plates=False, views=False)
     export_usd.run(job)
     export_usd.check(job)
