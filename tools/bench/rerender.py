@@ -57,8 +57,9 @@ class SolvedClip:
             raise InputError("the mesh has no face segments", where=str(work / "inverse_render" / "mesh.npz"))
         names = read_json(work / "track_landmarks" / "tracking.json")["segments"]
         self.segment_names = np.array(names)[segment]
-        eyes = TurningEyes.of(Surface(self.asset.mesh, segment, tuple(names)))
         cameras = [item.camera for item in self.held_out]
+        turn = any(camera.gaze is not None for camera in cameras)
+        eyes = TurningEyes.of(Surface(self.asset.mesh, segment, tuple(names))) if turn else None
         self.views = HeadViews(self.asset.mesh, self.asset.maps, SIZES, cameras, eyes=eyes)
 
     def compared(self) -> list[HeldOutFrame]:
