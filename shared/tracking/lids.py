@@ -14,9 +14,12 @@ from shared.compute.robust import ROBUST_SCALE
 from shared.geometry.transforms import projection_slope
 from shared.tracking.expression import turn_basis
 
-SHUT_READS = 0.1, 0.35
-"""Of the clip's open aperture: what the network still reports of shut lids, the more the darker the lashes are. Where a
-clip has a blink, its own lowest value between these is it; half closed is midway from there to open."""
+SHUT_READS = 0.1, 0.45
+"""Of an eye's open aperture: what the network still reports when it is shut, the more the darker its lashes are. Where
+the eye blinks, its own lowest value between these is it."""
+SHUT = 0.6
+"""Of the way from there to open: lids that are nearer are more than half closed, since the network sees them come down
+late."""
 LEAST_OPEN = 0.165
 """Of the eye's width: what is no farther open in most frames is shut throughout. Eyes that squint have 0.21, of shut
 ones the network reports up to 0.16 in hard light."""
@@ -52,8 +55,16 @@ def lids_of(lids_px: np.ndarray, centres: np.ndarray, camera_from_head: np.ndarr
             level, open_mm[eye] = _of_open_eyes(apertures[seen, eye], basis[seen])
             openness[seen, eye] = apertures[seen, eye] / level
             opening[0, eye] = open_mm[eye] / np.median(widths[seen, eye])
-    together, always_shut = _together(openness), _together(opening) < LEAST_OPEN
-    return Lids(openness, (together < half_closed(together)) | (always_shut & np.isfinite(openness)), open_mm)
+    shut = _together(from_shut(openness)) < SHUT
+    always_shut = _together(opening) < LEAST_OPEN
+    return Lids(openness, shut | (always_shut & np.isfinite(openness)), open_mm)
+
+
+def from_shut(openness: np.ndarray) -> np.ndarray:
+    """openness [F, 2] of lids -> the same, 0 where it is what the network reads of shut ones, 1 where they are open."""
+    lowest = np.min(openness, axis=0, initial=1.0, where=np.isfinite(openness))
+    reads = np.where(lowest > SHUT_READS[1], SHUT_READS[0], np.maximum(lowest, SHUT_READS[0]))
+    return (openness - reads) / (1.0 - reads)
 
 
 def _together(values: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shared.geometry.transforms import WORLD_FROM_CAMERA, project, rigid, rotation_from_vector
-from shared.tracking.lids import half_closed, lid_apertures, lids_of
+from shared.tracking.lids import from_shut, lid_apertures, lids_of
 
 FRAMES = 80
 INTRINSICS = np.array([[1700.0, 0.0, 320.0], [0.0, 1700.0, 320.0], [0.0, 0.0, 1.0]])
@@ -81,6 +81,8 @@ def test_an_eye_that_is_not_seen_is_neither_open_nor_shut():
     assert np.isnan(found.openness[5:9, 0]).all() and found.shut[12:15, 0].all()
 
 
-def test_half_closed_is_midway_from_what_shut_lids_read():
-    assert half_closed(np.array([[1.0, 0.2], [np.nan, 0.9]])) == pytest.approx(0.6)
-    assert half_closed(np.array([[1.0, 0.6]])) == half_closed(np.array([[1.0, -0.1]])) == pytest.approx(0.55)
+def test_openness_counts_from_what_shut_lids_read():
+    blinks, open_eyes = np.array([[1.0, 0.3], [np.nan, 0.65], [-0.2, 1.0]]), np.array([[1.0, 0.9], [0.55, 1.0]])
+    assert np.allclose(from_shut(blinks)[:, 1], [0.0, 0.5, 1.0])
+    assert np.allclose(from_shut(blinks)[[0, 2], 0], [1.0, -1.0 / 3.0])
+    assert np.allclose(from_shut(open_eyes), (open_eyes - 0.1) / 0.9)
