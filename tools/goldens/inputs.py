@@ -23,7 +23,7 @@ from tools.goldens.tiny import GOLDEN_FOLDER, SETTINGS, STAGES, TINY_SUBJECT, st
 
 _LEFT_OUT = {
     "sample_frames": ("contact_sheet.png",),
-    "track_landmarks": ("overlay.png", "curves.png", "residuals.png", "landmarks.npz"),
+    "track_landmarks": ("overlay.png", "curves.png", "residuals.png"),
     "init_albedo": ("segments.png", "segment_albedo.exr"),
     "inverse_render": ("shape.png",),
 }

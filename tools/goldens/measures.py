@@ -87,6 +87,8 @@ def _track_landmarks(folder: Path) -> Measures:
         "log deviations": Measure(np.log(deviation)),
         "landmarks, px": Measure(load_arrays(folder / "landmarks.npz")["landmarks_px"][:, ::20]),
         "skin, mm": Measure(mesh.vertices[_spread(skin)]),
+        "gaze": Measure(np.nan_to_num(poses["gaze"])),
+        "eyes that are shut": _same(*(len(facts["eyes"][f"shut_{side}"]) for side in ("right", "left"))),
         "number of tracks": _relative(facts["tracks"]),
         "reprojection": _relative(list(facts["reprojection_px"].values())),
         "depth noise": _relative(np.percentile(tracks["sigma_mm"], [10, 50, 90])),
