@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import shapes
 
-from shared.capture.landmarks import _warped
+from shared.capture.landmarks import warped
 from shared.compute.processor import use_baseline_opencv
 from shared.geometry.transforms import rigid, rotation_from_vector
 from shared.rendering.transfer import spread_vertices
@@ -56,13 +56,13 @@ def test_crops_for_landmarks_are_not_rounded_to_codes():
     rng = np.random.default_rng(2)
     picture = cv2.GaussianBlur(rng.integers(0, 256, (90, 120, 3)).astype(np.uint8), (0, 0), 2.0)
     turn = np.array([[0.5, -0.1, 10.3], [0.1, 0.5, 5.7]])
-    crop = _warped(picture, turn, 96)
+    crop = warped(picture, turn, 96)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     assert crop.dtype == np.float32
     assert np.abs(crop * 255 - cv2.warpAffine(picture, turn, (96, 96), flags=flags)).max() < 1.01
-    beyond = _warped(picture, np.array([[1.0, 0.0, -40.0], [0.0, 1.0, -30.0]]), 64)
+    beyond = warped(picture, np.array([[1.0, 0.0, -40.0], [0.0, 1.0, -30.0]]), 64)
     assert not beyond[:30].any() and not beyond[:, :40].any() and beyond[31:, 41:].min() > 0.0
-    assert not _warped(picture, np.array([[1.0, 0.0, 500.0], [0.0, 1.0, 500.0]]), 64).any()
+    assert not warped(picture, np.array([[1.0, 0.0, 500.0], [0.0, 1.0, 500.0]]), 64).any()
 
 
 def test_contrast_takes_each_codes_logarithm_from_a_table_of_doubles():
