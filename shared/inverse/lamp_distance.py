@@ -107,7 +107,8 @@ def fresh_highlights(solution: Solution, settings: AppearanceSettings) -> Soluti
 def describe_lamp(
     lamp: NearLamp | None, light: np.ndarray, record: dict, views: Views, moves: str
 ) -> dict:
-    """What solve.json says of the main lamp of a light [6 n^2, 3]; empty where its distance was not asked for.
+    """What solve.json says of the main lamp of a light [6 n^2, 3], as seen from the head's mean place, where envmap.exr
+    sees the light from; empty where its distance was not asked for.
 
     A ball of radiance L and radius r at a distance D gives pi L r^2 / D^2 head-on: that of the lamp's solid angle, the
     square of its irradiance over the integral of the squared radiance.
@@ -116,15 +117,15 @@ def describe_lamp(
         return dict(record)
     head = places_in_world(views.camera_from_head, moves).mean(0)
     resolution = round((len(light) / 6) ** 0.5)
-    texels = lamp.texels(resolution)
+    texels, seen = lamp.texels(resolution), lamp.seen_from(head, resolution)
     solid, own = cube_solid_angles(resolution)[texels], light[texels]
     grey = own.mean(1)
     solid_angle = float((grey @ solid) ** 2 / (grey**2 @ solid))
     return record | {
-        "distance_mm": round(float(np.linalg.norm(lamp.position - head)), 1),
+        "distance_mm": round(seen.distance_mm, 1),
         "position_mm": lamp.position.round(2).tolist(),
-        "centre_mm": np.round(lamp.centre, 2).tolist(),
-        "reach": round(lamp.radius, 5),
+        "centre_mm": head.round(2).tolist(),
+        "reach": round(seen.radius, 5),
         "radius_mm": round(lamp.distance_mm * (solid_angle / np.pi) ** 0.5, 2),
         "radiance": (solid @ own / solid_angle).round(4).tolist(),
     }

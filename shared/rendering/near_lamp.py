@@ -69,6 +69,16 @@ class NearLamp:
         """[3] mm, world space."""
         return np.array(self.centre) + self.distance_mm * np.array(self.axis)
 
+    def seen_from(self, place: np.ndarray, resolution: int) -> NearLamp:
+        """The same lamp as belongs to the light that latlong_at sees from another place [3] mm of world space;
+        resolution: of the light here."""
+        sources = self.centre + self.distance_mm * cube_directions(resolution)[self.texels(resolution)] - place
+        away = self.position - place
+        distance = float(np.linalg.norm(away))
+        cosine = (normalised(sources) @ away / distance).min()
+        radius = float(np.arccos(np.clip(cosine, -1.0, 1.0)) + 1.0 / resolution)
+        return NearLamp(distance, tuple(place.tolist()), tuple((away / distance).tolist()), radius)
+
     def texels(self, resolution: int) -> np.ndarray:
         """[K] int: texels of a cubemap that belong to it; at least the nearest."""
         cosine = cube_directions(resolution) @ np.array(self.axis)

@@ -17,6 +17,7 @@ from shared.geometry.transforms import (
 from shared.rendering.brdf import specular_cosine
 from shared.rendering.envmap import (
     cube_directions,
+    cube_from_latlong,
     cube_lookup,
     cube_solid_angles,
     latlong_directions,
@@ -195,3 +196,17 @@ def test_the_light_at_another_place_is_what_arrives_there():
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.02 * expected.max())
     at_centre = latlong_at(light, lamp, np.array(lamp.centre), 64)
     np.testing.assert_allclose(at_centre, latlong_from_cube(light, 64), atol=0.2, rtol=0.02)
+
+
+def test_a_lamp_seen_from_another_place_shines_as_it_did():
+    """With the light that arrives there, which is what files hold."""
+    poses, light, points = some_poses(), lamp_light(), open_points()
+    lamp = lamp_at(450.0, poses)
+    place = np.array(lamp.centre) + [30.0, -20.0, 60.0]
+    again, seen = lamp.seen_from(place, 16), cube_from_latlong(latlong_at(light, lamp, place, 128), 16)
+    assert again.centre == tuple(place)
+    np.testing.assert_allclose(again.position, lamp.position)
+    views = [LampView(SeenLamp.of(one, poses, "head"), 16, DIRECTIONS) for one in (lamp, again)]
+    before, after = (view.irradiance(points, everything(points), view.radiance(own))
+                     for view, own in zip(views, (light, seen), strict=True))
+    np.testing.assert_allclose(after, before, rtol=0.03, atol=0.03 * before.max())
