@@ -9,7 +9,7 @@ import pytest
 from quick import TINY
 
 from shared.errors import InputError
-from shared.io.arrays import read_json
+from shared.io.arrays import read_json, write_json
 from tools.bench import hard_light
 from tools.bench.hard_light import CLIPS, HardLightBench, all_cases, has_made
 from tools.bench.runner import run
@@ -72,6 +72,9 @@ def test_a_subject_is_kept_where_it_was_made_by_the_same_arguments(tmp_path):
     (tmp_path / "subject.yaml").touch()
     (tmp_path / "synthesis.json").write_text(json.dumps(asdict(wanted) | {"scan": "elsewhere/anna"}))
     assert has_made(tmp_path, wanted)
+    made = read_json(tmp_path / "synthesis.json")
+    write_json(tmp_path / "synthesis.json", {name: value for name, value in made.items() if name != "gaze"})
+    assert has_made(tmp_path, wanted), "made before there was such a setting"
     with pytest.raises(InputError, match="was made by other arguments.*seed 12"):
         has_made(tmp_path, settings_of("scan_25_apart", scans=SCAN))
     with pytest.raises(InputError, match="scan anna"):

@@ -89,7 +89,9 @@ def has_made(folder: Path, settings: SynthesisSettings) -> bool:
     InputError where it holds another."""
     if not (folder / "subject.yaml").exists():
         return False
-    wanted, there = _comparable(asdict(settings)), _comparable(read_json(folder / "synthesis.json"))
+    # What was not asked for yet when a subject was made, it has as by default.
+    made = asdict(SynthesisSettings()) | read_json(folder / "synthesis.json")
+    wanted, there = _comparable(asdict(settings)), _comparable(made)
     for name, value in wanted.items():
         if there.get(name) != value:
             raise InputError("was made by other arguments", where=str(folder), got=f"{name} {there.get(name)}",
