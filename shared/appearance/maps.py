@@ -6,8 +6,8 @@ import numpy as np
 
 from shared.appearance.fine_normals import normal_image
 from shared.appearance.texture import PRIOR_SPREAD, TexelMaterial
+from shared.geometry.eyeballs import EYE_ROUGHNESS
 from shared.imaging.texels import TexelSurface
-from shared.rendering.eye_shine import EYE_ROUGHNESS
 
 
 def make_maps(

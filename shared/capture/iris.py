@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shared.capture.landmarks import EYE_CORNERS_LEFT, EYE_CORNERS_RIGHT, load_network, run_network, warped
+from shared.capture.landmarks import EYE_CORNERS_LEFT, EYE_CORNERS_RIGHT, crop_under, load_network, run_network
 
 EYE_SIZE = 64
 EYE_ENLARGEMENT = 2.3
@@ -77,10 +77,8 @@ class IrisNetwork:
         image_from_crop = crop_of_eye(corners, left)
         if image_from_crop is None:
             return None
-        # cv2 counts pixel centres from 0.0, we from 0.5: shift on both sides.
-        warp = image_from_crop.copy()
-        warp[:, 2] += warp[:, :2] @ (0.5, 0.5) - 0.5
-        iris, contours = run_network(self._network, warped(rgb, warp, EYE_SIZE), (15, 3 * CONTOUR_COUNT))
+        crop = crop_under(rgb, image_from_crop, EYE_SIZE)
+        iris, contours = run_network(self._network, crop, (15, 3 * CONTOUR_COUNT))
         points = np.concatenate([iris.reshape(5, 3), contours.reshape(CONTOUR_COUNT, 3)[:LID_COUNT]])[:, :2]
         points = points.astype(np.float64) @ image_from_crop[:, :2].T + image_from_crop[:, 2]
         return EyePoints(points[:5], points[5:])

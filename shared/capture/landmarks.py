@@ -168,16 +168,22 @@ class FaceNetworks:
 
     def _landmarks_in_crop(self, rgb: np.ndarray, image_from_crop: np.ndarray) -> tuple[float, np.ndarray]:
         """Presence and points [468, 3] px from the crop that the affine map [2, 3] describes."""
-        # cv2 counts pixel centres from 0.0, we from 0.5: shift on both sides.
-        warp = image_from_crop.copy()
-        warp[:, 2] += warp[:, :2] @ (0.5, 0.5) - 0.5
-        crop = warped(rgb, warp, LANDMARK_SIZE)
+        crop = crop_under(rgb, image_from_crop, LANDMARK_SIZE)
         values, logit = run_network(self._landmarks, crop, (LANDMARK_COUNT * 3, 1))
         points = values.reshape(LANDMARK_COUNT, 3).astype(np.float64)
         scale = float(np.sqrt(np.linalg.det(image_from_crop[:, :2])))
         points[:, :2] = points[:, :2] @ image_from_crop[:, :2].T + image_from_crop[:, 2]
         points[:, 2] *= scale
         return float(_sigmoid(logit)[0]), points
+
+
+def crop_under(rgb: np.ndarray, image_from_crop: np.ndarray, size: int) -> np.ndarray:
+    """float32 [size, size, 3] in [0, 1]: the crop of a picture (uint8) that the affine map image_from_crop [2, 3]
+    describes, px with centres at +0.5."""
+    # cv2 counts pixel centres from 0.0, we from 0.5: shift on both sides.
+    warp = image_from_crop.copy()
+    warp[:, 2] += warp[:, :2] @ (0.5, 0.5) - 0.5
+    return warped(rgb, warp, size)
 
 
 def warped(rgb: np.ndarray, image_from_crop: np.ndarray, size: int) -> np.ndarray:

@@ -17,6 +17,8 @@ SIDES = ("right", "left")
 
 IRIS_MM = 5.85
 """Radius of the visible iris in adults."""
+TEAR_FILM_IOR, EYE_ROUGHNESS = 1.376, 0.08
+"""Index of refraction of the cornea, which its tear film makes smooth, and that smoothness as a material has it."""
 
 
 @dataclass(frozen=True, eq=False)

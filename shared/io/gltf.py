@@ -23,12 +23,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from shared.errors import LimnError
-from shared.geometry.eyeballs import Eyeball
+from shared.geometry.eyeballs import EYE_ROUGHNESS, TEAR_FILM_IOR, Eyeball
 from shared.geometry.mesh import Mesh, unique_pairs
 from shared.geometry.parts import HEAD, RigidPart, head_parts
 from shared.io.export_maps import integer_codes
 from shared.io.usd_capture import UsdCapture, eye_turns, world_from_head_rigid, world_from_usd_camera
-from shared.io.usd_material import EYE_IOR, EYE_ROUGHNESS
 
 METRES_PER_MM = 0.001
 _FLOAT, _UINT = 5126, 5125
@@ -38,7 +37,7 @@ _FIRST_EYE = 2
 _EYE_MATERIAL = {
     "name": "eye",
     "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": EYE_ROUGHNESS},
-    "extensions": {"KHR_materials_ior": {"ior": EYE_IOR}},
+    "extensions": {"KHR_materials_ior": {"ior": TEAR_FILM_IOR}},
 }
 _KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 

@@ -26,11 +26,10 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdShade
 
+from shared.geometry.eyeballs import EYE_ROUGHNESS, TEAR_FILM_IOR
+
 IOR = 1.5
 """Index of refraction whose F0, ((n - 1) / (n + 1))^2, is the 0.04 of the BRDF."""
-
-EYE_IOR, EYE_ROUGHNESS = 1.376, 0.08
-"""Of the cornea, which its tear film makes smooth."""
 
 # Limn's map -> (UsdPreviewSurface input, OpenPBR input): the one place where the names meet.
 SHADER_INPUTS = {
@@ -78,7 +77,7 @@ class Finish:
     roughness: float | None = None
 
 
-SKIN, EYE = Finish(), Finish(EYE_IOR, EYE_ROUGHNESS)
+SKIN, EYE = Finish(), Finish(TEAR_FILM_IOR, EYE_ROUGHNESS)
 EYE_MAPS = ("diffuse_albedo",)
 """Those of SHADER_INPUTS that the eyes read: intensity, roughness and relief of the others are skin's."""
 

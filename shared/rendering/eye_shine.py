@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.geometry.eyeballs import IRIS_MM, gaze_direction
+from shared.geometry.eyeballs import IRIS_MM, TEAR_FILM_IOR, gaze_direction
 from shared.geometry.mesh import interpolate, normalised
 from shared.geometry.raycast import RAY_START_MM
 from shared.imaging.image_sampling import SurfaceViewer
@@ -17,7 +17,6 @@ from shared.imaging.turning_eyes import TurningEyes
 from shared.rendering.brdf import F0
 from shared.rendering.shading import VertexShading
 
-TEAR_FILM_IOR, EYE_ROUGHNESS = 1.376, 0.08
 EYE_INTENSITY = ((TEAR_FILM_IOR - 1.0) / (TEAR_FILM_IOR + 1.0)) ** 2 / F0
 """Specular intensity of a surface of that index of refraction: 0.63."""
 CORNEA_MM, LIMBUS_MM = 7.8, 1.0

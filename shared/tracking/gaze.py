@@ -22,11 +22,9 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from shared.compute.robust import ROBUST_SCALE, cauchy_weight
-from shared.geometry.eyeballs import Eyeball, gaze_direction, gaze_towards
+from shared.geometry.eyeballs import IRIS_MM, Eyeball, gaze_direction, gaze_towards
 from shared.geometry.transforms import camera_centres, project
 
-IRIS_RADIUS_MM = 5.85
-"""Of adults: the plane in which a sphere is cut by so large a rim is that of the iris."""
 CENTRE_SIGMA_MM, DISTANCE_SIGMA_MM = np.array([1.2, 1.2, 1.5]), 0.5
 """How well a fitted head tells the centres, and the distance of the iris' plane from them."""
 OFFSET_SIGMA, ELSEWHERE_SIGMA = np.radians([2.0, 10.0])
@@ -76,9 +74,9 @@ class Gaze:
 
 
 def iris_distance(eyeballs: Sequence[Eyeball]) -> float:
-    """From the centres of eyeballs to the planes of their irises, mm."""
+    """From the centres of eyeballs to the planes of their irises, mm: where a rim as large as an iris cuts them."""
     radius = np.mean([ball.radius for ball in eyeballs])
-    return float(np.sqrt(max(radius**2 - IRIS_RADIUS_MM**2, IRIS_RADIUS_MM**2)))
+    return float(np.sqrt(max(radius**2 - IRIS_MM**2, IRIS_MM**2)))
 
 
 def solve_gaze(
