@@ -31,11 +31,6 @@ class Eyeball:
     centre: np.ndarray
     radius: float
 
-    def turned(self, points: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """Points [N, 3] on the eyeball as it looks straight ahead -> where they are with the rotation [3, 3] of its
-        gaze, mm."""
-        return (points - self.centre) @ rotation.T + self.centre
-
 
 def eyeballs_of(surface: Surface) -> tuple[Eyeball, Eyeball] | None:
     """The right and the left eyeball of a head; None where the mesh has no segment `eyes`, or not one on each side."""

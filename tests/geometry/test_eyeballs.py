@@ -66,7 +66,7 @@ def test_the_rotation_of_a_gaze_turns_the_eye_to_it():
     np.testing.assert_allclose(rotation @ np.swapaxes(rotation, 1, 2), np.tile(np.eye(3), (20, 1, 1)), atol=1e-12)
     right, _ = eyeballs_of(two_balls())
     front = right.centre + [0.0, 0.0, right.radius]
-    turned = right.turned(front[None], rotation[0])[0]
+    turned = right.centre + rotation[0] @ (front - right.centre)
     np.testing.assert_allclose(turned, right.centre + right.radius * gaze_direction(GAZES[0]), atol=1e-9)
 
 
