@@ -4,7 +4,8 @@ Reads    sample_frames: the cropped frames and their intrinsics. The subject's o
          subject.yaml names them.
 Writes   poses.npz, mesh.npz, landmarks.npz, tracks.npz, tracking.json, overlay.png, curves.png, residuals.png.
 Method   468 landmarks a frame start the poses, dense flow and then tracks against the clip's mean texture, adjusted as
-         one rigid body, hold them still; the head model is fitted to the tracks and then bent to them freely. Its size
+         one rigid body, hold them still; the head model is fitted to the tracks and then bent to them freely, its lids
+         laid on those of the frames. Its size
          is the head model's mean and what the irises say, or that of a given length. Frames of another expression than
          most are left out. Irises and lids of each frame tell gaze and blinks.
 Fails    no landmarks in three frames; skin that cannot be tracked (too small, blurred, or not the same head); a head
@@ -21,7 +22,7 @@ from shared.contract.records import LANDMARKS, MESH, TRACKED_POSES, TRACKING, TR
 
 STAGE = Stage(
     name="track_landmarks",
-    version=14,
+    version=15,
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
     given=("landmarks", "poses"),
@@ -102,9 +103,9 @@ def look_at_frames(job: Job, frames):
     return points, presence, greys, SeenEyes.of(eyes) if job.params.eyes else None
 
 
-def build_clip(job: Job, frames, greys: list, used: np.ndarray, landmarks_px: np.ndarray, given_poses):
+def build_clip(job: Job, frames, greys: list, used: np.ndarray, landmarks_px: np.ndarray, given_poses, seen):
     """Contrast pictures and unusable pixels of the frames with a face. greys: of all frames, which go as their pictures
-    come; used [F] int: positions of those frames; given_poses [F, 4, 4] mm or None."""
+    come; used [F] int: positions of those frames; given_poses [F, 4, 4] mm or None; seen: eyes of all frames."""
     from shared.compute.parallel import in_order
     from shared.tracking.tracked_clip import TrackedClip, face_width
 
@@ -126,6 +127,7 @@ def build_clip(job: Job, frames, greys: list, used: np.ndarray, landmarks_px: np
         frames.size,
         None if given_poses is None else given_poses[used],
         job.subject.hold_poses,
+        None if seen is None else seen.lids_px[used],
     )
 
 
@@ -318,7 +320,7 @@ def run(job: Job) -> None:
             expected="3 or more",
             hint="film one head, facing the camera at the start, 200 px wide or more",
         )
-    clip = build_clip(job, frames, greys, used, landmarks_px, given_poses)
+    clip = build_clip(job, frames, greys, used, landmarks_px, given_poses, seen)
     track = track_head(clip, model, read_settings(job, frames.focal_known), job.progress, job.note)
     publish(job, frames, model, used, landmarks_px, presence, seen, track)
 

@@ -232,7 +232,7 @@ _LAMP = (
     Field("lamp.tried[].distance_mm", "The distance from the face's mean place; null: far away.", "number or null",
           unit="mm"),
     Field("lamp.tried[].held_out", "Error on the held-out frames."),
-    Field("lamp.fall", "By how much the error of the held-out frames fell from far away to the best distance.",
+    Field("lamp.fall", "By how much the mean absolute error of the frames fell from far away to the best distance.",
           optional=True),
     Field("lamp.standard_error", "The standard error of that over the frames.", optional=True),
 )

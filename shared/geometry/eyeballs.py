@@ -17,6 +17,8 @@ SIDES = ("right", "left")
 
 IRIS_MM = 5.85
 """Radius of the visible iris in adults."""
+EYE_RADIUS_MM = 12.0
+"""Of an adult's eyeball [Bekerman2014]."""
 TEAR_FILM_IOR, EYE_ROUGHNESS = 1.376, 0.08
 """Index of refraction of the cornea, which its tear film makes smooth, and that smoothness as a material has it."""
 

@@ -41,6 +41,15 @@ class Surface:
         wanted = [self.segment_names.index(name) for name in names if name in self.segment_names]
         return np.isin(self.face_segment, wanted)
 
+    def faces_near(self, names: Sequence[str], edges: int) -> np.ndarray:
+        """[faces] bool: faces in the named segments and those within so many edges of them."""
+        found = self.faces_of(names)
+        for _ in range(edges):
+            reached = np.zeros(len(self.mesh.vertices), bool)
+            reached[self.mesh.faces[found]] = True
+            found = reached[self.mesh.faces].any(1)
+        return found
+
     def vertices_of(self, names: Sequence[str]) -> np.ndarray:
         """[V] bool: vertices of faces in the named segments; all of them where the mesh has no segments."""
         if self.face_segment is None:

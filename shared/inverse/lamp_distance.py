@@ -1,9 +1,11 @@
-"""How far away the main lamp stands: solved by trying distances, judged by held-out frames.
+"""How far away the main lamp stands: solved by trying distances, judged by the errors of all frames.
 
 A lamp at a distance between half a metre and two lights forehead and chin differently, and more or less as the head
 turns and moves towards it. That is one number more than a far light has. The light is fitted anew with the lamp at each
-of a few distances, far among them, and a parabola through the residuals of held-out frames finds what lies between; the
-lamp is near where their residual falls by more than its standard error, and only light with a lamp in it is tried.
+of a few distances, far among them, and a parabola through the residuals of held-out frames finds what lies between. The
+lamp is near where the mean absolute error falls by more than its standard error over all frames: one number does not
+follow the noise of those it is fitted to, and the few that are held out decide by chance. Only light with a lamp in it
+is tried.
 
 Reference: [Breiman1984], section 3.4.3 (the one-standard-error rule).
 """
@@ -66,7 +68,7 @@ def find_lamp(
     chart: ChartStatement | None,
     context: RunContext,
 ) -> LitByLamp:
-    """Lets the main lamp of a solved light stand near where settings.lamp_distance says so, or held-out frames; views:
+    """Lets the main lamp of a solved light stand near where settings.lamp_distance says so, or the frames; views:
     those that the light was solved from; lit: what it was solved on, along an even set of directions."""
     wanted, nothing = settings.lamp_distance, LitByLamp(lit, solution, {})
     if wanted == FAR or len(views.frames_of_lights) > 1 or not lit_by_lamp(lit.coarse, solution):
@@ -188,7 +190,7 @@ def solve_distance(
     moves: str,
     note: Callable[[str], None],
 ) -> tuple[Solution, dict]:
-    """The solution with the lamp at the distance that held-out frames have, or with none, and what was tried.
+    """The solution with the lamp at the distance that the frames have, or with none, and what was tried.
 
     capture: of these views, along directions that suit the lamp; start: of the light, with a lamp in it.
     """
@@ -211,8 +213,8 @@ def solve_distance(
     if between is not None:
         nearest = min(tried, key=lambda one: abs(1.0 / one - 1.0 / between))
         tried[between] = fit(between, tried[nearest], STEPS)
-    best = min(tried, key=lambda one: tried[one].held_out)
-    errors = [tried[one].frame_errors[~capture.fitted] for one in (FAR, best)]
+    best = min(tried, key=lambda one: tried[one].frame_errors.mean())
+    errors = [tried[one].frame_errors for one in (FAR, best)]
     fall, standard_error = gain(*errors) if len(errors[0]) > 1 else (0.0, 0.0)
     near = best != FAR and fall > standard_error
     record = {

@@ -13,6 +13,9 @@ REFERENCES = {
     "Beaton1974":
         "Beaton, Tukey, The Fitting of Power Series, Meaning Polynomials, Illustrated on Band-Spectroscopic Data. "
         "Technometrics 16, 1974.",
+    "Bekerman2014":
+        "Bekerman, Gottlieb, Vaiman, Variations in Eyeball Diameters of the Healthy Adults. Journal of Ophthalmology, "
+        "2014.",
     "Blanz1999": "Blanz, Vetter, A Morphable Model for the Synthesis of 3D Faces. SIGGRAPH 1999.",
     "Botsch2008":
         "Botsch, Sorkine, On Linear Variational Surface Deformation Methods. IEEE Transactions on Visualization and "

@@ -21,6 +21,9 @@ OUTLINED = ("forehead", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "
 """Segments that may form the outline. The neck bends, and clothes cover it."""
 TRACK_REACH_MM = 6.0
 """So far around a track point the tracks tell the surface better than an outline does."""
+RIM_EDGES = 5
+"""Lids' rims, so many edges around the sockets, stay where tracking has laid them: they are thinner than a pixel, and
+shading would crumple them."""
 MODEL_ERROR_MM = 2.0
 """How far a fitted head model lies from a head."""
 
@@ -76,8 +79,10 @@ def refine_shape(
     """The surface with its mesh refined under a known light; begun: its mesh as it was refined before, with as many
     subdivisions or fewer, from where this goes on."""
     solver = ShapeSolver(views, surface.tracks, reflectance, appearance, sizes, settings, context)
-    start, refined = solver.refine(surface.mesh, surface.faces_of(SHAPED), surface.faces_of(HELD), begun)
-    placed = move_without_crossing(start.vertices, refined.vertices, refined.faces)
+    held = surface.faces_of(HELD) | surface.faces_near(("eye_sockets",), RIM_EDGES)
+    start, refined = solver.refine(surface.mesh, surface.faces_of(SHAPED), held, begun)
+    eyes = np.repeat(surface.faces_of(("eyes",)), len(refined.faces) // len(surface.mesh.faces))
+    placed = move_without_crossing(start.vertices, refined.vertices, refined.faces[~eyes])  # lids rest on eyeballs
     stopped = int((np.abs(placed - refined.vertices).max(1) > 1e-6).sum())
     if stopped:
         context.note(f"shape: {stopped} vertices moved less than wanted, so that the surface does not cut itself")

@@ -54,7 +54,8 @@ REACHES_MM, LATER_REACHES_MM = (15.0,) * 4 + (6.0,) * 8, (6.0,) * 4
 APERTURES = np.array(
     [(160, 144), (159, 145), (158, 153), (387, 373), (386, 374), (385, 380), (82, 87), (13, 14), (312, 317)]
 )
-"""Pairs of landmarks above and below the openings of eyes and mouth."""
+OF_EYES = 6
+"""Pairs of landmarks above and below the openings of eyes and mouth, those of the eyes first."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,22 @@ class FitWeights:
         return replace(self, track_mm=float(np.hypot(self.track_mm, noise.of_mean(EFFECTIVE_TRACKS))))
 
 
+@dataclass(frozen=True)
+class Pins:
+    """Places on edges of the model, vertices [N, 2] and share [N] of the way from the one to the other, that belong at
+    points [N, 3] of track space as seen from the front, to deviation_mm."""
+
+    points: np.ndarray
+    vertices: np.ndarray
+    share: np.ndarray
+    deviation_mm: float
+
+    def of(self, values: np.ndarray) -> np.ndarray:
+        """values [..., V, 3] of vertices at the places, [..., N, 3]."""
+        first, second = (values[..., ends, :] for ends in self.vertices.T)
+        return first + self.share[:, None] * (second - first)
+
+
 PUBLISHED = FitWeights(track_mm=2.8 * (100.0 / 30.0) ** 0.5, landmark_mm=2.8)
 """Landmarks 100, skin 30, as [Xu2025] weighs landmark and photometric losses: what the pictures say of the
 skin reaches the fit here as tracks."""
@@ -88,11 +105,13 @@ def fit_codes(
     landmarks: np.ndarray,
     weights: FitWeights,
     before: HeadFit | None = None,
+    pins: Pins | None = None,
 ) -> HeadFit:
     """Similarity, identity and expression by alternating closest points and one bounded linear solution.
 
     points [N, 3] and landmarks [468, 3] in track space (NaN rows: unknown). before: a fit of the same head, whose codes
-    it starts from; a third of the steps are enough then.
+    it starts from; a third of the steps are enough then. pins: of the lids; without them landmarks tell how far eyes
+    are open.
     """
     known = np.isfinite(landmarks[:, 0]) & (model.landmark_weight > 0) & (model.landmark_face >= 0)
     if before is None:
@@ -107,11 +126,11 @@ def fit_codes(
     fit = HeadFit(scale, rotation, translation, identity, expression, vertices)
     usable = pullable_vertices(model)
     for reach in REACHES_MM if before is None else LATER_REACHES_MM:
-        fit = _code_step(model, fit, points, landmarks, known, weights, usable, reach)
+        fit = _code_step(model, fit, points, landmarks, known, weights, usable, reach, pins)
     return fit
 
 
-def _code_step(model, fit, points, landmarks, known, weights, usable, reach_mm) -> HeadFit:
+def _code_step(model, fit, points, landmarks, known, weights, usable, reach_mm, pins) -> HeadFit:
     """One linearised step of similarity and codes; the codes are solved whole, the similarity as an increment."""
     in_head, normals = fit.to_head(points), vertex_normals(fit.vertices, model.faces)
     near, offset, weight = _closest(fit.vertices, normals, usable, in_head, reach_mm)
@@ -127,18 +146,19 @@ def _code_step(model, fit, points, landmarks, known, weights, usable, reach_mm) 
     rows = [root * np.concatenate([-moving, shape_rows], axis=1)]
     rhs = [root[:, 0] * ((in_head - neutral[near]) * n).sum(1)]
 
-    named = fit.to_head(landmarks[known])
-    arm = named - centre
     at = np.concatenate([_landmark_basis(model, basis, known) for basis in bases])
     base = interpolate(neutral, model.faces, model.landmark_face[known], model.landmark_bary[known])
     gain = np.sqrt(model.landmark_weight[known]) / weights.landmark_mm
-    for axis, unit in enumerate(np.eye(3)):
-        moving = np.concatenate([np.cross(arm, unit), np.tile(unit, (len(arm), 1)), arm[:, [axis]]], axis=1)
-        rows.append(gain[:, None] * np.concatenate([-moving, at[:, :, axis].T], axis=1))
-        rhs.append(gain * (named - base)[:, axis])
-    opening, opening_rhs = _aperture_rows(model, fit, landmarks, weights.aperture_mm)
-    rows.append(opening)
-    rhs.append(opening_rhs)
+    equations = [_place_rows(fit.to_head(landmarks[known]), base, at, gain, centre, (0, 1, 2))]
+    pairs = APERTURES
+    if pins is not None and len(pins.points):
+        gain, pairs = np.full(len(pins.points), 1.0 / pins.deviation_mm), APERTURES[OF_EYES:]
+        at = np.concatenate([pins.of(basis) for basis in bases])
+        equations.append(_place_rows(fit.to_head(pins.points), pins.of(neutral), at, gain, centre, (0, 1)))
+    equations.append(_aperture_rows(model, fit, landmarks, pairs, weights.aperture_mm))
+    for block, right_side in equations:
+        rows.append(block)
+        rhs.append(right_side)
     codes = sum(map(len, bases))
     deviation = np.r_[
         np.full(len(model.identity_basis), weights.identity), np.full(len(model.expression_basis), weights.expression)
@@ -156,6 +176,20 @@ def _code_step(model, fit, points, landmarks, known, weights, usable, reach_mm) 
     return _moved(model, fit, solved, centre)
 
 
+def _place_rows(
+    named: np.ndarray, base: np.ndarray, basis: np.ndarray, gain: np.ndarray, centre: np.ndarray, axes: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Equations that put places of the surface, base [N, 3] plus codes times basis [K, N, 3], at points named [N, 3] of
+    head space that move about centre [3], along some axes; gain [N]."""
+    arm, rows, rhs = named - centre, [], []
+    for axis in axes:
+        unit = np.eye(3)[axis]
+        moving = np.concatenate([np.cross(arm, unit), np.tile(unit, (len(arm), 1)), arm[:, [axis]]], axis=1)
+        rows.append(gain[:, None] * np.concatenate([-moving, basis[:, :, axis].T], axis=1))
+        rhs.append(gain * (named - base)[:, axis])
+    return np.concatenate(rows), np.concatenate(rhs)
+
+
 def _moved(model: HeadModel, fit: HeadFit, solved: np.ndarray, centre: np.ndarray) -> HeadFit:
     """Applies rotation, shift and growth (about centre, head space) and takes over the codes."""
     turn, grow = rotation_from_vector(solved[:3]), float(np.exp(solved[6]))
@@ -166,9 +200,9 @@ def _moved(model: HeadModel, fit: HeadFit, solved: np.ndarray, centre: np.ndarra
     return HeadFit(fit.scale * grow, rotation, translation, identity, expression, vertices)
 
 
-def _aperture_rows(model, fit, landmarks, deviation_mm) -> tuple[np.ndarray, np.ndarray]:
+def _aperture_rows(model, fit, landmarks, pairs, deviation_mm) -> tuple[np.ndarray, np.ndarray]:
     """How far eyes and mouth are open tells the expression alone: heights between landmark pairs, in head space."""
-    pairs = APERTURES[(model.landmark_face[APERTURES] >= 0).all(1) & np.isfinite(landmarks[APERTURES]).all((1, 2))]
+    pairs = pairs[(model.landmark_face[pairs] >= 0).all(1) & np.isfinite(landmarks[pairs]).all((1, 2))]
     chosen = np.zeros(len(landmarks), bool)
     chosen[pairs] = True
     place = np.cumsum(chosen) - 1

@@ -1,11 +1,11 @@
 """Where each eye looks in each frame: from the irises' centres, the poses, and what is known of eyes.
 
 An eye turns about a fixed centre in the head, with the plane of the iris at a fixed distance before it. The line from
-one to the other is the gaze. Both are those of the mesh's eyeballs, corrected by the clip, so that these eyeballs show
-the irises where they were seen when the gaze turns them; eyes of anatomy are smaller (10.3 mm from the centre to the
-iris [Fry1962], not 13 to 14), and turn by more. Gaze, centres and distance are solved together by Gauss-Newton steps: a
-centre that is a millimetre off turns all gaze by 4 degrees, and only what the person looks at, and that both eyes look
-at one place, tells the two apart.
+one to the other is the gaze. Both are those of the mesh's eyeballs (some 10.4 mm from the centre to the iris, as
+[Fry1962] has it), corrected by the clip, so that these eyeballs show the irises where they were seen when the gaze
+turns them. Gaze, centres and distance are solved together by Gauss-Newton steps: a centre that is a millimetre off
+turns all gaze by 5 degrees, and only what the person looks at, and that both eyes look at one place, tells the two
+apart.
 
 What gaze does between frames is a random walk with heavy tails (Cauchy): it rests and jumps, so that noise is averaged
 where it rests and a jump stays one. It rests on the camera or in the head, whichever the clip supports. The line of

@@ -28,9 +28,12 @@ from shared.tracking.first_poses import (
     landmark_poses,
     start_from_landmarks,
 )
+from shared.tracking.fit_eyeballs import eye_centres, set_eyeballs
 from shared.tracking.fit_head import FitWeights, HeadFit, fit_codes, landmarks_on_points
+from shared.tracking.fit_lids import LidContours, LidMargins, lay_lids, lid_contours, lid_pins
 from shared.tracking.fit_surface import ThinPlate, fit_surface
 from shared.tracking.head_model import HeadModel
+from shared.tracking.lids import lids_of
 from shared.tracking.pose_uncertainty import estimate_uncertainty, focal_elsewhere
 from shared.tracking.texture_tracking import TrackingPass, coarse_pass, look_from_afar, solve_texture, track_texture
 from shared.tracking.texture_tracks import Windows
@@ -301,11 +304,13 @@ def _summary(label: str, found: Adjusted) -> str:
 
 class _HeadFits:
     """The head fitted again and again as tracks get better. A rough fit starts from the codes of the one before; the
-    last starts from the mean head, so that its shape does not hang on how often the head was fitted."""
+    last starts from the mean head, so that its shape does not hang on how often the head was fitted, and has its lids
+    where the clip shows them."""
 
     def __init__(self, model: HeadModel, weights: FitWeights) -> None:
         self._model, self._weights, self._plate = model, weights, ThinPlate(model)
         self._last: HeadFit | None = None
+        self._margins = LidMargins.of(model)
 
     def fit(self, clip: TrackedClip, found: Adjusted, rough: bool) -> tuple[HeadFit, DepthNoise]:
         """Codes, then the free correction, to track points and to the landmarks as they lie among them. rough: see
@@ -319,6 +324,28 @@ class _HeadFits:
         )
         noise = depth_noise(solution, reliable, clip.intrinsics)
         weights = self._weights.for_depth_noise(noise)
-        codes = fit_codes(self._model, solution.points, landmarks, weights, self._last if rough else None)
-        self._last = fit_surface(self._plate, codes, solution.points, noise, weights, rough)
-        return self._last, noise
+        if rough:
+            codes = fit_codes(self._model, solution.points, landmarks, weights, self._last)
+            self._last = fit_surface(self._plate, codes, solution.points, noise, weights, rough)
+            return self._last, noise
+        contours = self._contours(clip, found)
+        if contours is None:
+            codes = fit_codes(self._model, solution.points, landmarks, weights)
+            return fit_surface(self._plate, codes, solution.points, noise, weights), noise
+        pins = lid_pins(self._margins, self._last.vertices, contours)
+        codes = self._laid(fit_codes(self._model, solution.points, landmarks, weights, pins=pins), contours)
+        fit = self._laid(fit_surface(self._plate, codes, solution.points, noise, weights), contours)
+        return replace(fit, vertices=set_eyeballs(self._model, fit.vertices)), noise
+
+    def _contours(self, clip: TrackedClip, found: Adjusted) -> LidContours | None:
+        """Of the lids, in track space; None where model or clip has none."""
+        if clip.lids_px is None or self._margins is None:
+            return None
+        shown, poses = clip.subset(np.nonzero(found.reliable)[0]), found.solution.camera_from_points[found.reliable]
+        rough, centres = self._last, eye_centres(self._model, self._last.vertices)
+        lids = lids_of(shown.lids_px, centres, rough.camera_from_head(poses), clip.intrinsics)
+        down = -rough.rotation[1] / rough.scale
+        return lid_contours(shown, lids, poses, found.solution.points, down)
+
+    def _laid(self, fit: HeadFit, contours: LidContours) -> HeadFit:
+        return replace(fit, vertices=lay_lids(self._plate, self._margins, fit.vertices, contours.moved(fit)))

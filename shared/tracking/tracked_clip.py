@@ -49,7 +49,8 @@ class TrackedClip:
     """F frames: contrast and detail pictures [H, W] uint8, unusable pixels, landmarks [F, 468, 2] px, time [F] s.
 
     intrinsics [3, 3] and size (width, height) belong to the pictures. given_poses [F, 4, 4]: where to start instead of
-    the landmarks; hold_poses: keep them as they are.
+    the landmarks; hold_poses: keep them as they are. lids_px [F, 2, 16, 2] px (shared.capture.iris), None where nobody
+    looked for eyes.
     """
 
     contrast: list[np.ndarray]
@@ -61,6 +62,7 @@ class TrackedClip:
     size: tuple[int, int]
     given_poses: np.ndarray | None = None
     hold_poses: bool = False
+    lids_px: np.ndarray | None = None
 
     @property
     def count(self) -> int:
@@ -70,12 +72,14 @@ class TrackedClip:
     def subset(self, frames: np.ndarray) -> TrackedClip:
         """Chosen frames [K], indices."""
         given = None if self.given_poses is None else self.given_poses[frames]
+        lids = None if self.lids_px is None else self.lids_px[frames]
         pictures = {name: [getattr(self, name)[i] for i in frames] for name in ("contrast", "detail", "unusable")}
         return replace(
             self,
             landmarks_px=self.landmarks_px[frames],
             time_s=self.time_s[frames],
             given_poses=given,
+            lids_px=lids,
             **pictures,
         )
 

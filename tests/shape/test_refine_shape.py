@@ -254,10 +254,17 @@ def test_a_refined_mesh_goes_on_from_the_next_level_or_on_the_finest(toy, monkey
     assert len(start.faces) == len(refined.faces) == len(faces) * 4**subdivisions
 
 
+def test_a_few_points_that_fit_worse_do_not_decide_about_a_mesh():
+    before, after, worse = (SimpleNamespace(fitted=0.01, held_out=held_out, frame_errors=np.full(4, error))
+                            for held_out, error in ((0.010, 0.006), (0.012, 0.0061), (0.012, 0.0072)))
+    assert judge_shape(before, after)["refined"] and not judge_shape(before, worse)["refined"]
+
+
 @pytest.mark.parametrize("name, before, after", [("held_out", (0.03, 0.02), (0.01, 0.03)),
                                                  ("fitted", (0.03, 0.0), (0.01, 0.0))])
 def test_a_mesh_is_judged_by_held_out_frames_where_there_are_any(name, before, after):
-    solutions = [SimpleNamespace(fitted=fitted, held_out=held_out) for fitted, held_out in (before, after)]
+    solutions = [SimpleNamespace(fitted=fitted, held_out=held_out, frame_errors=np.full(4, 0.5 * (held_out or fitted)))
+                 for fitted, held_out in (before, after)]
     record = judge_shape(*solutions)
     assert record["refined"] is (name == "fitted")
     assert list(record[name]) == ["before", "after"]

@@ -1,0 +1,244 @@
+"""The lids of a fitted head laid where the clip shows them.
+
+Hardly a track point lies on lids, and the face mesh's landmarks slide over them, so that a fitted head's margins come
+out millimetres beside the picture's. The iris network's contours (shared.capture.iris) follow the margins, but end
+before the outer corner; the face mesh's go beyond it: of open eyes their mean is taken. It steers the codes of the head
+model as landmarks do; what the codes leave is taken up by sliding the margins over the eyeball, with the lids' skin and
+the socket's following as a thin plate. Where an eye is shut in the whole clip both margins meet on the line of
+shared.tracking.closing_line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial import cKDTree
+
+from shared.capture.iris import FACE_MESH_LIDS, LOWER_LID, UPPER_LID
+from shared.compute.sparse_solve import factorised
+from shared.geometry.mesh import mesh_edges, normalised
+from shared.geometry.transforms import camera_centres
+from shared.tracking.closing_line import closing_line
+from shared.tracking.fit_eyeballs import eye_centres
+from shared.tracking.fit_head import HeadFit, Pins, landmarks_on_points
+from shared.tracking.fit_surface import ThinPlate
+from shared.tracking.head_model import HeadModel
+from shared.tracking.lids import Lids
+from shared.tracking.tracked_clip import TrackedClip
+
+CONTOUR_FRAMES = 40
+"""The contours are taken from so many frames with open eyes, around the middle of the motion."""
+PIN_MM = 3.0
+"""Deviation of a contour's point where it steers the codes; some thirty of them count as one or two."""
+FRONT_EDGES = 3, 5
+"""A lid's rim is so many edges deep, of the lower and of the upper lid: there its skin turns to the front."""
+OPEN_BEHIND_MM = 1.0
+"""Rims of shut lids meet at their front edges; behind them each is so far away from the line."""
+LEAST_FORWARD = 0.2
+"""A margin is so far before the eye's centre at least, as a share of its distance from it."""
+HOLD = 100.0
+"""Weight of the margins' places against the plate's bending."""
+
+
+@dataclass(frozen=True, eq=False)
+class LidMargins:
+    """Where the lids end in the model: [eye][lower, upper], right eye first. loops: vertices of the inner edge, where
+    the socket begins, from the outer to the inner corner, both included; fronts: vertices of the edge that one sees,
+    and the share of the way from corner to corner at which each lies."""
+
+    loops: tuple[tuple[np.ndarray, np.ndarray], ...]
+    fronts: tuple[tuple[tuple[np.ndarray, np.ndarray], ...], ...]
+
+    @classmethod
+    def of(cls, model: HeadModel) -> LidMargins | None:
+        """None where the model has no lids with sockets behind them."""
+        if not {"lids", "eye_sockets"} <= set(model.segment_names):
+            return None
+        edges, edge_of_face, _ = mesh_edges(model.faces)
+        touched = [np.unique(edge_of_face[model.segment(name)]) for name in ("lids", "eye_sockets")]
+        rim = edges[np.intersect1d(*touched)]
+        right = model.template[rim[:, 0], 0] < 0
+        loops = tuple(_halves(rim[own], model.template) for own in (right, ~right))
+        lids = model.faces[model.segment("lids")]
+        return cls(loops, tuple(_fronts(halves, lids, model.template) for halves in loops))
+
+
+def _fronts(
+    halves: tuple[np.ndarray, np.ndarray], faces: np.ndarray, template: np.ndarray
+) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Of both halves: vertices so many edges away along faces [F, 3] that are nearer to this half than to the other,
+    but not to a corner, with the share of the way at which the half's nearest vertex lies."""
+    rings = [np.unique(np.concatenate(halves))]
+    reached = rings[0]
+    for _ in range(max(FRONT_EDGES)):
+        rings.append(np.setdiff1d(faces[np.isin(faces, reached).any(1)], reached))
+        reached = np.union1d(reached, rings[-1])
+    trees, found = [cKDTree(template[half, :2]) for half in halves], []
+    for own, other, half, edges in zip(trees, trees[::-1], halves, FRONT_EDGES, strict=True):
+        (apart, at), (elsewhere, _) = (tree.query(template[rings[edges], :2]) for tree in (own, other))
+        chosen = (apart < elsewhere) & (at > 0) & (at < len(half) - 1)
+        found.append((rings[edges][chosen], at[chosen] / (len(half) - 1)))
+    return tuple(found)
+
+
+def _halves(rim: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A closed loop of edges [E, 2] -> its lower and upper half, from the corner farthest from the nose."""
+    neighbours: dict[int, list[int]] = {}
+    for a, b in rim.tolist():
+        neighbours.setdefault(a, []).append(b)
+        neighbours.setdefault(b, []).append(a)
+    away = {vertex: abs(template[vertex, 0]) for vertex in neighbours}
+    outer, inner = max(away, key=away.get), min(away, key=away.get)
+    halves = []
+    for following in neighbours[outer]:
+        path = [outer, following]
+        while path[-1] != inner:
+            path.append(next(vertex for vertex in neighbours[path[-1]] if vertex != path[-2]))
+        halves.append(np.array(path))
+    return tuple(sorted(halves, key=lambda half: template[half, 1].mean()))
+
+
+@dataclass(frozen=True)
+class LidContours:
+    """Where the clip shows the margins: points [2, 2, 9, 3] of the right and left eye's lower and upper lid, from the
+    outer to the inner corner, NaN where the eye is not seen; shut [2] bool: in the whole clip, the two are one then."""
+
+    points: np.ndarray
+    shut: np.ndarray
+
+    def moved(self, fit: HeadFit) -> LidContours:
+        """From track space to head space."""
+        return replace(self, points=fit.to_head(self.points.reshape(-1, 3)).reshape(self.points.shape))
+
+
+def lid_contours(
+    clip: TrackedClip, lids: Lids, camera_from_points: np.ndarray, track_points: np.ndarray, down: np.ndarray
+) -> LidContours:
+    """Of a clip whose eyes were looked for, in the space of its track_points [N, 3] and at their depth. lids: its own;
+    camera_from_points [F, 4, 4]; down [3]: a millimetre down the face in that space."""
+    directions = normalised(camera_centres(camera_from_points))
+    middling = np.argsort(-(directions @ normalised(directions.mean(0))))
+    found, shut = np.full((2, 2, len(LOWER_LID), 3), np.nan), np.zeros(2, bool)
+    for eye in range(2):
+        seen = np.isfinite(clip.lids_px[:, eye]).all((1, 2))
+        shut[eye] = seen.any() and lids.shut[seen, eye].all()
+        use = middling[(seen & (lids.shut[:, eye] == shut[eye]))[middling]][:CONTOUR_FRAMES]
+        if len(use):
+            poses = camera_from_points[use]
+            lids_px = clip.lids_px[use, eye]
+            if not shut[eye]:
+                lids_px = 0.5 * (lids_px + clip.landmarks_px[use][:, FACE_MESH_LIDS[eye]])
+            margin = landmarks_on_points(lids_px, poses, track_points, clip.intrinsics)
+            found[eye] = margin[list(LOWER_LID)], margin[list(UPPER_LID)]
+            if shut[eye]:
+                pictures = [clip.contrast[i] for i in use]
+                found[eye] = closing_line(pictures, found[eye, 0], down, poses, clip.intrinsics)
+    return LidContours(found, shut)
+
+
+def lid_pins(margins: LidMargins, vertices: np.ndarray, contours: LidContours) -> Pins:
+    """The contours' points (track space) with their places on the margins: at the same share of the way from corner to
+    corner; vertices [V, 3] of a rough fit."""
+    points, ends, shares = [], [], []
+    for loops, shown in zip(margins.loops, contours.points, strict=True):
+        for loop, curve in zip(loops, shown, strict=True):
+            if np.isfinite(curve).all():
+                place = np.interp(_way(curve), _way(vertices[loop]), np.arange(len(loop)))
+                first = np.minimum(place.astype(int), len(loop) - 2)
+                points.append(curve)
+                ends.append(np.stack([loop[first], loop[first + 1]], axis=1))
+                shares.append(place - first)
+    if not points:
+        return Pins(np.zeros((0, 3)), np.zeros((0, 2), int), np.zeros(0), PIN_MM)
+    return Pins(np.concatenate(points), np.concatenate(ends), np.concatenate(shares), PIN_MM)
+
+
+def lay_lids(plate: ThinPlate, margins: LidMargins, vertices: np.ndarray, contours: LidContours) -> np.ndarray:
+    """Vertices [V, 3] with the margins on the contours (head space); nothing but lids and sockets moves."""
+    held, targets = [], []
+    for eye, (centre, shown) in enumerate(zip(eye_centres(plate.model, vertices), contours.points, strict=True)):
+        if np.isfinite(shown).all():
+            if contours.shut[eye]:
+                own, places = _shut(margins, eye, vertices, shown[0], centre)
+            else:
+                own, places = _open(margins.loops[eye], vertices, shown, centre)
+            held.append(own)
+            targets.append(places)
+    if not held:
+        return vertices
+    held, first = np.unique(np.concatenate(held), return_index=True)
+    return vertices + _followed(plate, held, np.concatenate(targets)[first] - vertices[held])
+
+
+def _open(
+    loops: tuple[np.ndarray, np.ndarray], vertices: np.ndarray, shown: np.ndarray, centre: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [n] and their places [n, 3]: both loops on their contours [2, 9, 3]."""
+    places = [
+        _on_curve(_way(vertices[loop]), curve, centre, np.linalg.norm(vertices[loop] - centre, axis=1))
+        for loop, curve in zip(loops, shown, strict=True)
+    ]
+    return np.concatenate(loops), np.concatenate(places)
+
+
+def _shut(
+    margins: LidMargins, eye: int, vertices: np.ndarray, line: np.ndarray, centre: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [n] and their places [n, 3]: the front edges of both lids meet on the line [9, 3], and their rims part
+    behind it."""
+    held, places, shares = [], [], np.linspace(0.0, 1.0, 33)
+    profiles = [_profile(shares, share, np.linalg.norm(vertices[own] - centre, axis=1)) for own, share in
+                margins.fronts[eye]]  # fmt: skip
+    depth = np.mean(profiles, axis=0)
+    for sign, loop, (front, share) in zip((-1.0, 1.0), margins.loops[eye], margins.fronts[eye], strict=True):
+        held += [front, loop]
+        places.append(_on_curve(share, line, centre, np.interp(share, shares, depth)))
+        way = _way(vertices[loop])
+        away = sign * OPEN_BEHIND_MM * np.sqrt(np.sin(np.pi * way))
+        places.append(_on_curve(way, line, centre, np.linalg.norm(vertices[loop] - centre, axis=1), away))
+    return np.concatenate(held), np.concatenate(places)
+
+
+def _profile(shares: np.ndarray, share: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Radius [n] at a share [n] of the way, at even shares [m]."""
+    order = np.argsort(share)
+    return np.interp(shares, share[order], radius[order])
+
+
+def _on_curve(
+    way: np.ndarray, curve: np.ndarray, centre: np.ndarray, radius: np.ndarray, above: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """Places [n, 3] at shares way [n] of a curve [9, 3], so far above it, mm, as seen from the front, and as far as
+    radius [n] from the eye's centre [3]."""
+    target = PchipInterpolator(_way(curve), curve[:, :2])(way)
+    target[:, 1] += above
+    across = np.square(target - centre[:2]).sum(1)
+    forward = np.sqrt(np.maximum(radius**2 - across, np.square(LEAST_FORWARD * radius)))
+    return np.column_stack([target, centre[2] + forward])
+
+
+def _way(line: np.ndarray) -> np.ndarray:
+    """[n] share of the way along a line [n, 3] of points, seen from the front."""
+    way = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1))]
+    return way / way[-1]
+
+
+def _followed(plate: ThinPlate, held: np.ndarray, moves: np.ndarray) -> np.ndarray:
+    """Displacements [V, 3]: of held [n] vertices near moves [n, 3], of lids and sockets as a plate, none elsewhere."""
+    model = plate.model
+    soft = model.segment("lids", "eye_sockets")
+    free = np.setdiff1d(np.unique(model.faces[soft]), np.unique(model.faces[~soft]))
+    place = np.full(len(model.template), -1)
+    place[free] = np.arange(len(free))
+    own, moves = place[held[place[held] >= 0]], moves[place[held] >= 0]
+    pull = sparse.csr_matrix((np.full(len(own), HOLD), (own, own)), shape=(len(free), len(free)))
+    wanted = np.zeros((len(free), 3))
+    wanted[own] = HOLD * moves
+    moved = np.zeros(model.template.shape)
+    moved[free] = factorised((plate.bending[free][:, free] + pull).tocsc()).solve(wanted)
+    return moved
+
+
