@@ -101,7 +101,7 @@ STAGE = Stage(
         Parameter("fixed_parts", str, "", "Parts of the model that model=auto leaves as the other parameters say, "
                   "separated by commas: visibility, specular, light, geometry, roughness.", former="forced"),
         Parameter("lamp_distance", str, "auto", "How far the light's main lamp stands from the head: auto, as near as "
-                  "held-out frames ask for, far, or so many mm."),
+                  "the frames ask for, far, or so many mm."),
         Parameter("points", int, 4000, "Surface points that the light is solved from.", "", 200, 40000),
         Parameter("coarse_points", int, 1000, "As many of them on which the light comes to rest, before a last step on "
                   "all; 0: all from the first step on.", "", 0, 40000),
