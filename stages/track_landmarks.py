@@ -209,13 +209,10 @@ def size_head(job: Job, frames, model, kept: np.ndarray, seen, track, fits: np.n
     """-> the track at the head's own size, its surface, its eyes (None without `eyes`), and what set that size. kept
     [F] int: positions of the frames with a pose, which fits [U] bool has of the tracked ones; seen: eyes of all frames;
     lens [3, 3]."""
-    from shared.geometry.mesh import Mesh
-    from shared.geometry.surface import Surface
     from shared.tracking.eyes import head_scale, track_eyes
 
     def measured(track):
-        mesh = Mesh(track.fit.vertices, model.faces, model.uvs, model.face_uvs)
-        surface = Surface(mesh, model.face_segment, model.segment_names)
+        surface = model.surface(track.fit.vertices)
         if seen is None:
             return surface, None
         poses = track.camera_from_head[fits]

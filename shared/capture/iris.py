@@ -26,7 +26,6 @@ CONTOUR_COUNT, LID_COUNT = 71, 16
 LOWER_LID, UPPER_LID = tuple(range(9)), (0, 9, 10, 11, 12, 13, 14, 15, 8)
 """Positions among the points of the lids, each from the outer to the inner corner; both lids end in the corners."""
 
-
 FACE_MESH_LIDS = (
     (33, 7, 163, 144, 145, 153, 154, 155, 133, 246, 161, 160, 159, 158, 157, 173),
     (263, 249, 390, 373, 374, 380, 381, 382, 362, 466, 388, 387, 386, 385, 384, 398),

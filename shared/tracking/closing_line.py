@@ -27,7 +27,7 @@ BEND_MM = 0.3
 SEEN = 20.0
 """Codes of contrast by which a valley counts as one of the other deviations, and by which the line goes on beyond the
 contour's end; the skin's own texture has some ten."""
-BEND = 2
+DEGREE = 2
 """Degree of the contour's curve: the network's points are uneven at its ends."""
 
 
@@ -44,7 +44,7 @@ def closing_line(
     space of the points; camera_from_points [F, 4, 4]; intrinsics [3, 3].
     """
     way = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(contour, axis=0), axis=1))]
-    curve = np.polynomial.polynomial.polyfit(way / way[-1], contour, BEND)
+    curve = np.polynomial.polynomial.polyfit(way / way[-1], contour, DEGREE)
     beyond = round(LONGER * PLACES)
     places = np.arange(-beyond, PLACES + beyond) / (PLACES - 1)
     along, offsets = np.polynomial.polynomial.polyval(places, curve).T, np.arange(-UP_MM, DOWN_MM, STEP_MM)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import brentq
 
-from shared.geometry.eyeballs import EYE_RADIUS_MM, fit_sphere
+from shared.geometry.eyeballs import EYE_RADIUS_MM, eyeballs_of
 from shared.geometry.mesh import normalised
 from shared.tracking.head_model import HeadModel
 
@@ -22,24 +22,17 @@ BEFORE_MM = 9.0
 SEARCH_MM = 12.0
 
 
-def eye_vertices(model: HeadModel) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices of the right and the left eyeball."""
-    own = np.unique(model.faces[model.segment("eyes")])
-    right = model.template[own, 0] < 0
-    return own[right], own[~right]
-
-
 def eye_centres(model: HeadModel, vertices: np.ndarray) -> np.ndarray:
     """[2, 3] mm: of the right and the left eyeball of vertices [V, 3]."""
-    return np.stack([fit_sphere(vertices[own])[0] for own in eye_vertices(model)])
+    return np.stack([ball.centre for ball in eyeballs_of(model.surface(vertices))])
 
 
 def set_eyeballs(model: HeadModel, vertices: np.ndarray) -> np.ndarray:
     """Vertices [V, 3] mm with both eyeballs as spheres of EYE_RADIUS_MM that the lids rest on."""
-    placed, lids = vertices.copy(), np.unique(model.faces[model.segment("lids")])
-    for own, centre in zip(eye_vertices(model), eye_centres(model, vertices), strict=True):
-        centre, old = _behind_lids(vertices[lids], centre), centre
-        placed[own] = centre + EYE_RADIUS_MM * normalised(vertices[own] - old)
+    placed, lids = vertices.copy(), vertices[np.unique(model.faces[model.segment("lids")])]
+    for ball in eyeballs_of(model.surface(vertices)):
+        outward = normalised(vertices[ball.vertices] - ball.centre)
+        placed[ball.vertices] = _behind_lids(lids, ball.centre) + EYE_RADIUS_MM * outward
     return placed
 
 
@@ -54,7 +47,6 @@ def _behind_lids(lids: np.ndarray, centre: np.ndarray) -> np.ndarray:
         away = np.linalg.norm(before - centre - [0.0, 0.0, forward], axis=1) - EYE_RADIUS_MM
         return float(np.quantile(away, RESTING_SHARE)) - CLEARANCE_MM
 
-    ends = -SEARCH_MM, SEARCH_MM
-    if clearance(ends[0]) * clearance(ends[1]) > 0.0:
+    if clearance(-SEARCH_MM) * clearance(SEARCH_MM) > 0.0:
         return centre
-    return centre + [0.0, 0.0, brentq(clearance, *ends)]
+    return centre + [0.0, 0.0, brentq(clearance, -SEARCH_MM, SEARCH_MM)]

@@ -16,8 +16,8 @@ from scipy.optimize import lsq_linear
 from scipy.spatial import cKDTree
 
 from shared.compute.robust import cauchy_weight
-from shared.geometry.mesh import interpolate, vertex_normals
-from shared.geometry.transforms import project, rotation_from_vector, similarity_from_points
+from shared.geometry.mesh import interpolate, normalised, vertex_normals
+from shared.geometry.transforms import camera_centres, project, rotation_from_vector, similarity_from_points
 from shared.tracking.depth_noise import DepthNoise
 from shared.tracking.head_model import HeadModel
 
@@ -238,6 +238,13 @@ def _closest(vertices, normals, usable, points, reach_mm):
     offset = ((points - vertices[near]) * normals[near]).sum(1)
     spread = 3.0 * np.median(np.abs(offset)) + 0.05
     return near, offset, cauchy_weight(offset, spread, distance < reach_mm)
+
+
+def most_central(camera_from_points: np.ndarray) -> np.ndarray:
+    """[F] indices of frames, those first that see the head from the middle of all views; camera_from_points
+    [F, 4, 4]."""
+    directions = normalised(camera_centres(camera_from_points))
+    return np.argsort(-(directions @ normalised(directions.mean(0))))
 
 
 def landmarks_on_points(

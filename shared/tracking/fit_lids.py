@@ -19,11 +19,10 @@ from scipy.spatial import cKDTree
 
 from shared.capture.iris import FACE_MESH_LIDS, LOWER_LID, UPPER_LID
 from shared.compute.sparse_solve import factorised
-from shared.geometry.mesh import mesh_edges, normalised
-from shared.geometry.transforms import camera_centres
+from shared.geometry.mesh import mesh_edges
 from shared.tracking.closing_line import closing_line
 from shared.tracking.fit_eyeballs import eye_centres
-from shared.tracking.fit_head import HeadFit, Pins, landmarks_on_points
+from shared.tracking.fit_head import HeadFit, Pins, landmarks_on_points, most_central
 from shared.tracking.fit_surface import ThinPlate
 from shared.tracking.head_model import HeadModel
 from shared.tracking.lids import Lids
@@ -58,8 +57,7 @@ class LidMargins:
         if not {"lids", "eye_sockets"} <= set(model.segment_names):
             return None
         edges, edge_of_face, _ = mesh_edges(model.faces)
-        touched = [np.unique(edge_of_face[model.segment(name)]) for name in ("lids", "eye_sockets")]
-        rim = edges[np.intersect1d(*touched)]
+        rim = edges[np.intersect1d(edge_of_face[model.segment("lids")], edge_of_face[model.segment("eye_sockets")])]
         right = model.template[rim[:, 0], 0] < 0
         loops = tuple(_halves(rim[own], model.template) for own in (right, ~right))
         lids = model.faces[model.segment("lids")]
@@ -119,13 +117,12 @@ def lid_contours(
 ) -> LidContours:
     """Of a clip whose eyes were looked for, in the space of its track_points [N, 3] and at their depth. lids: its own;
     camera_from_points [F, 4, 4]; down [3]: a millimetre down the face in that space."""
-    directions = normalised(camera_centres(camera_from_points))
-    middling = np.argsort(-(directions @ normalised(directions.mean(0))))
+    central = most_central(camera_from_points)
     found, shut = np.full((2, 2, len(LOWER_LID), 3), np.nan), np.zeros(2, bool)
     for eye in range(2):
         seen = np.isfinite(clip.lids_px[:, eye]).all((1, 2))
         shut[eye] = seen.any() and lids.shut[seen, eye].all()
-        use = middling[(seen & (lids.shut[:, eye] == shut[eye]))[middling]][:CONTOUR_FRAMES]
+        use = central[(seen & (lids.shut[:, eye] == shut[eye]))[central]][:CONTOUR_FRAMES]
         if len(use):
             poses = camera_from_points[use]
             lids_px = clip.lids_px[use, eye]

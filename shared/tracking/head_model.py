@@ -14,6 +14,7 @@ import numpy as np
 import scipy.sparse as sparse
 
 from shared.geometry.mesh import Mesh, interpolate, loop_subdivision, midpoint_subdivision
+from shared.geometry.surface import Surface
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,10 @@ class HeadModel:
     def mesh(self, identity: np.ndarray | None = None, expression: np.ndarray | None = None) -> Mesh:
         """The surface with its texture coordinates for codes identity [<=I], expression [<=E], as in shape."""
         return Mesh(self.shape(identity, expression), self.faces, self.uvs, self.face_uvs)
+
+    def surface(self, vertices: np.ndarray) -> Surface:
+        """Vertices [V, 3] mm with this topology and its segments."""
+        return Surface(Mesh(vertices, self.faces, self.uvs, self.face_uvs), self.face_segment, self.segment_names)
 
     def landmarks(self, vertices: np.ndarray) -> np.ndarray:
         """[468, 3] places of the landmarks on vertices [V, 3] of this topology; NaN where landmark_face is -1."""

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shared.errors import InputError
-from shared.geometry.mesh import normalised
-from shared.geometry.transforms import camera_centres, project, rigid, rotation_range_deg
+from shared.geometry.transforms import project, rigid, rotation_range_deg
 from shared.tracking.bundle import Tracks, place_points, zoomed
 from shared.tracking.depth_noise import DepthNoise, depth_noise
 from shared.tracking.first_poses import (
@@ -29,7 +28,7 @@ from shared.tracking.first_poses import (
     start_from_landmarks,
 )
 from shared.tracking.fit_eyeballs import eye_centres, set_eyeballs
-from shared.tracking.fit_head import FitWeights, HeadFit, fit_codes, landmarks_on_points
+from shared.tracking.fit_head import FitWeights, HeadFit, fit_codes, landmarks_on_points, most_central
 from shared.tracking.fit_lids import LidContours, LidMargins, lay_lids, lid_contours, lid_pins
 from shared.tracking.fit_surface import ThinPlate, fit_surface
 from shared.tracking.head_model import HeadModel
@@ -317,25 +316,23 @@ class _HeadFits:
         shared.tracking.fit_surface."""
         solution, reliable = found.solution, found.reliable
         poses = solution.camera_from_points[reliable]
-        directions = normalised(camera_centres(poses))
-        central = np.argsort(-(directions @ normalised(directions.mean(0))))[:LANDMARK_FRAMES]
+        central = most_central(poses)[:LANDMARK_FRAMES]
         landmarks = landmarks_on_points(
             clip.landmarks_px[reliable][central], poses[central], solution.points, clip.intrinsics
         )
         noise = depth_noise(solution, reliable, clip.intrinsics)
         weights = self._weights.for_depth_noise(noise)
-        if rough:
-            codes = fit_codes(self._model, solution.points, landmarks, weights, self._last)
-            self._last = fit_surface(self._plate, codes, solution.points, noise, weights, rough)
-            return self._last, noise
-        contours = self._contours(clip, found)
-        if contours is None:
-            codes = fit_codes(self._model, solution.points, landmarks, weights)
-            return fit_surface(self._plate, codes, solution.points, noise, weights), noise
-        pins = lid_pins(self._margins, self._last.vertices, contours)
-        codes = self._laid(fit_codes(self._model, solution.points, landmarks, weights, pins=pins), contours)
-        fit = self._laid(fit_surface(self._plate, codes, solution.points, noise, weights), contours)
-        return replace(fit, vertices=set_eyeballs(self._model, fit.vertices)), noise
+        contours = None if rough else self._contours(clip, found)
+        pins = None if contours is None else lid_pins(self._margins, self._last.vertices, contours)
+        before = self._last if rough else None
+        fit = fit_codes(self._model, solution.points, landmarks, weights, before, pins)
+        fit = fit if contours is None else self._laid(fit, contours)
+        fit = fit_surface(self._plate, fit, solution.points, noise, weights, rough)
+        if contours is not None:
+            fit = self._laid(fit, contours)
+            fit = replace(fit, vertices=set_eyeballs(self._model, fit.vertices))
+        self._last = fit
+        return fit, noise
 
     def _contours(self, clip: TrackedClip, found: Adjusted) -> LidContours | None:
         """Of the lids, in track space; None where model or clip has none."""

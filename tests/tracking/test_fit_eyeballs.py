@@ -2,18 +2,19 @@
 
 import numpy as np
 
-from shared.geometry.eyeballs import EYE_RADIUS_MM, fit_sphere
-from shared.tracking.fit_eyeballs import eye_centres, eye_vertices, set_eyeballs
+from shared.geometry.eyeballs import EYE_RADIUS_MM, eyeballs_of, fit_sphere
+from shared.tracking.fit_eyeballs import eye_centres, set_eyeballs
 
 
 def test_eyeballs_are_spheres_of_their_size_where_the_model_has_them(model):
     placed = set_eyeballs(model, model.template)
-    for side, own in enumerate(eye_vertices(model)):
+    eyes = [ball.vertices for ball in eyeballs_of(model.surface(model.template))]
+    for side, own in enumerate(eyes):
         centre, radius = fit_sphere(placed[own])
         assert abs(radius - EYE_RADIUS_MM) < 1e-6
         assert np.allclose(np.linalg.norm(placed[own] - centre, axis=1), EYE_RADIUS_MM)
         assert np.allclose(centre[:2], eye_centres(model, model.template)[side, :2])
-    other = np.setdiff1d(np.arange(len(model.template)), np.concatenate(eye_vertices(model)))
+    other = np.setdiff1d(np.arange(len(model.template)), np.concatenate(eyes))
     assert np.array_equal(placed[other], model.template[other])
 
 

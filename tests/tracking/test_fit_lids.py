@@ -27,6 +27,11 @@ def head(model):
     return fine, LidMargins.of(fine)
 
 
+def activated(model, activation: float, *actions: str) -> np.ndarray:
+    """Expression codes in which these facial actions are active."""
+    return np.where(np.isin(model.expression_names, actions), activation, 0.0)
+
+
 def shown_by(margins, vertices, shut=(False, False)) -> LidContours:
     """Nine points of each margin, evenly along it."""
     points = np.array([[vertices[loop[np.linspace(0, len(loop) - 1, 9).round().astype(int)]] for loop in loops]
@@ -57,9 +62,7 @@ def test_margins_run_from_the_outer_to_the_inner_corner(head):
 
 def test_margins_come_to_lie_on_the_contours_and_the_rest_of_the_face_stays(head):
     model, margins = head
-    names = list(model.expression_names)
-    squint = np.zeros(len(names))
-    squint[[names.index("eye_squint_left"), names.index("eye_wide_right")]] = 0.6
+    squint = activated(model, 0.6, "eye_squint_left", "eye_wide_right")
     contours = shown_by(margins, model.shape(None, squint) + [0.8, -1.5, 0.0])
     laid = lay_lids(ThinPlate(model), margins, model.template, contours)
     before, after = (off_mm(margins, vertices, contours) for vertices in (model.template, laid))
@@ -85,10 +88,7 @@ def test_an_eye_that_nobody_saw_keeps_its_lids(head):
 
 def test_shut_lids_leave_no_eyeball_to_be_seen(head):
     model, margins = head
-    names = list(model.expression_names)
-    blink = np.zeros(len(names))
-    blink[[names.index("eye_blink_left"), names.index("eye_blink_right")]] = 0.5
-    vertices = model.shape(None, blink)
+    vertices = model.shape(None, activated(model, 0.5, "eye_blink_left", "eye_blink_right"))
     line = shown_by(margins, model.template, (True, True))
     line.points[:, 1] = line.points[:, 0]
     shut = set_eyeballs(model, lay_lids(ThinPlate(model), margins, vertices, line))
@@ -106,16 +106,13 @@ def test_shut_lids_leave_no_eyeball_to_be_seen(head):
 def test_pins_steer_the_codes(head):
     """A blink that no track point shows."""
     model, margins = head
-    names = list(model.expression_names)
-    blink = np.zeros(len(names))
-    blink[[names.index("eye_blink_left"), names.index("eye_blink_right")]] = 0.4
-    truth = model.shape(None, blink)
+    truth = model.shape(None, activated(model, 0.4, "eye_blink_left", "eye_blink_right"))
     skin = np.unique(model.faces[model.segment("cheek_left", "cheek_right", "nose", "forehead", "chin", "jaw")])
     landmarks = model.landmarks(model.template)
     pins = lid_pins(margins, model.template, shown_by(margins, truth))
     without = fit_codes(model, truth[skin], landmarks, FitWeights())
     fitted = fit_codes(model, truth[skin], landmarks, FitWeights(), pins=pins)
-    chosen = names.index("eye_blink_right")
+    chosen = model.expression_names.index("eye_blink_right")
     assert without.expression[chosen] < 0.15 < 0.25 < fitted.expression[chosen] < 0.55
 
 
