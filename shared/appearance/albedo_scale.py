@@ -2,14 +2,16 @@
 colour chart where one is in view.
 
 Twice the light on half the albedo gives the same diffuse picture. Three statements fix the factor, each a normal
-distribution over logarithms, and a chart is a fourth (chart_scale):
+distribution over logarithms, and a chart is another (chart_scale):
 
 - skin's luminance: log Y is normal with the median and the spread of reference skins of all tones;
 - skin's chroma lies on the locus of measured skins: log R/G and log B/G are linear in log Y, sigma as found there;
 - the light on the skin is white after the camera's own white balance: log R/G and log B/G ~ N(0, 0.15).
 
+A fourth only keeps the skin's brightest places from returning more than the lightest reference skin.
+
 With u [3] the log of the mean irradiance on the skin and y [3] the log of the mean radiance that it returns, albedo is
-exp(y - u) and all of it is one quadratic in u.
+exp(y - u) and all of it is one quadratic in u, but for the fourth.
 
 References: skin I to VI of the Physically Based database (physicallybased.info, CC0), the same that OpenPBR viewers
 offer; ColorChecker patches "light skin" and "dark skin" (sRGB values of X-Rite, November 2014).
@@ -41,7 +43,10 @@ REFERENCE_SKINS = np.array(
 LUMINANCE_SIGMA = float(np.std(np.log(REFERENCE_SKINS @ LUMINANCE), ddof=1))
 """Of the reference skins' log luminance: 0.87. Anything narrower darkens the fair and lightens the dark."""
 WHITE_SIGMA = 0.15
+BRIGHTEST, BRIGHTEST_SIGMA = 0.95, 0.05
+"""The quantile of the skin's albedo that no reference skin's exceeds, and by how much, in the logarithm, it may."""
 HIGHLIGHT_SIGMA = 0.08
+"""Relative standard deviation of a specular intensity that the clip shows."""
 MODEL_ERROR = 0.003
 """Share of the diffuse radiance that passes for highlights where shape or visibility are a little off."""
 
@@ -123,6 +128,7 @@ def resolve_scale(
     white_sigma: float = WHITE_SIGMA,
     chart: tuple[np.ndarray, np.ndarray] | None = None,
     relative_light: np.ndarray | None = None,
+    log_brightest: np.ndarray | None = None,
 ) -> tuple[np.ndarray, float]:
     """The factor on the light per channel and the specular intensity that are jointly most likely.
 
@@ -130,7 +136,8 @@ def resolve_scale(
     scale that diffuse skin cannot: with the light multiplied by k, channel c wants s k_c = t_c. log_albedo,
     log_irradiance [3] are the skin's present means; specular_prior: mean of s and standard deviation of its logarithm;
     chart: the log factor [3] on the light that a colour chart asks for, and its covariance [3, 3]; relative_light: see
-    scale_prior. With a chart the highlights give s alone: on the scale their range has little to add, and the model's
+    scale_prior; log_brightest [3]: log of the skin's present albedo at the quantile BRIGHTEST, None: it is not asked.
+    With a chart the highlights give s alone: on the scale their range has little to add, and the model's
     errors pass for highlights.
     -> log k [3], and s, the prior's mean without highlights.
     """
@@ -141,18 +148,25 @@ def resolve_scale(
         right = np.concatenate([right, whitening @ (log_irradiance + chart[0])])
     mean, sigma = specular_prior
     alone = np.linalg.lstsq(matrix, right - matrix @ log_irradiance, rcond=None)[0]
+    ceiling = np.log(REFERENCE_SKINS.max())
+
+    def on_skin(log_factor: np.ndarray) -> np.ndarray:
+        unlikely = matrix @ (log_irradiance + log_factor) - right
+        if log_brightest is None or chart is not None:
+            return unlikely
+        return np.append(unlikely, np.maximum(log_brightest - log_factor - ceiling, 0.0) / BRIGHTEST_SIGMA)
+
     if highlights is None:
-        return alone, mean
-    best = np.clip(highlights.intensity, 0.05, 2.0)
+        return least_squares(on_skin, alone, method="lm").x, mean
     spread = _highlight_spread(highlights, mean)
 
     def on_highlights(log_factor: np.ndarray, log_intensity: float) -> np.ndarray:
-        amplitude = (log_intensity + log_factor - np.log(best)) / spread
+        amplitude = (np.exp(log_intensity + log_factor) - highlights.intensity) / spread
         robust = np.sign(amplitude) * np.sqrt(np.log1p(amplitude**2))
         return np.append(robust, (log_intensity - np.log(mean)) / sigma)
 
     def jointly(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([matrix @ (log_irradiance + x[:3]) - right, on_highlights(x[:3], x[3])])
+        return np.concatenate([on_skin(x[:3]), on_highlights(x[:3], x[3])])
 
     if chart is not None:
         solved = least_squares(lambda x: on_highlights(alone, x[0]), [np.log(mean)], method="lm").x
@@ -162,9 +176,10 @@ def resolve_scale(
 
 
 def _highlight_spread(highlights: Highlights, mean_intensity: float) -> np.ndarray:
-    """Standard deviation [3] of the log intensities: the diffuse model's errors and, where highlights are faint or few,
+    """Standard deviation [3] of the intensities: the diffuse model's errors and, where highlights are faint or few,
     what the samples leave open. Beyond it the loss is Cauchy's: channels that contradict skin have met something else.
     """
-    modelled = HIGHLIGHT_SIGMA * highlights.diffuse_share / highlights.diffuse_share.mean()
-    sampled = 1.0 / (highlights.precision * mean_intensity**2)
-    return np.sqrt(modelled**2 + sampled + (highlights.diffuse_share * MODEL_ERROR) ** 2)
+    relative = HIGHLIGHT_SIGMA * highlights.diffuse_share / highlights.diffuse_share.mean()
+    modelled = (relative * np.maximum(highlights.intensity, mean_intensity)) ** 2
+    passing = (mean_intensity * MODEL_ERROR * highlights.diffuse_share) ** 2
+    return np.sqrt(modelled + 1.0 / highlights.precision + passing)

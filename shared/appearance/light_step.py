@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from scipy.sparse.linalg import LinearOperator, cg
 
-from shared.appearance.albedo_scale import resolve_scale
+from shared.appearance.albedo_scale import BRIGHTEST, resolve_scale
 from shared.appearance.preconditioner import MOST_TEXELS, LightPreconditioner, curvature_of_some
 from shared.appearance.problem import AppearanceProblem, AppearanceState
 from shared.appearance.projection import (
@@ -49,7 +49,8 @@ are what the samples tell least of, and come last: steps that stop before leave 
 
 @dataclass(frozen=True, eq=False)
 class LinearisedFit:
-    """The problem at a state, whose albedo is the best under its light, and what does not change while the light does.
+    """The problem at a state, whose albedo and, once highlights count, specular intensity are the best under its light,
+    and what does not change while the light does.
 
     transport, errors: the state's; highlights_count: whether highlights say something about the light and the scale;
     slopes: of the lobes, None where the roughness is not sought; irradiance, reflection [3, P, F]: the forward model;
@@ -91,8 +92,12 @@ class LinearisedFit:
         specular_fit, highlights = None, state.specular * reflection
         if highlights_count:
             slope = None if slopes is None else transport.roughness_slope(slopes, light, irradiance)
-            specular_fit = SpecularFit(settings, state, errors, irradiance, reflection, slope, weight, evidence)
+            given = (settings, state, errors, irradiance, reflection, slope, weight, evidence)
+            specular_fit = SpecularFit(*given)
+            design_effect = specular_fit.design_effect_of(errors, irradiance, problem.patches)
+            specular_fit = SpecularFit(*given, design_effect)
             highlights = specular_fit.highlights
+            state = replace(state, specular=float(np.clip(specular_fit.best[0], *SPECULAR_RANGE)))
         albedo = best_albedo(errors, irradiance, highlights, weight, problem.typical_albedo(state))
         skin, albedo_slope = None, None
         if problem.skin_prior is not None:
@@ -135,7 +140,7 @@ class LinearisedFit:
             return None
         slope = None if self.slopes is None else self.transport.roughness_slope(self.slopes, light, irradiance)
         return SpecularFit(self.problem.settings, self.state, self.errors, irradiance, reflection, slope, self.weight,
-                           self.evidence)
+                           self.evidence, self.specular_fit.design_effect)
 
     def cost(self, params: np.ndarray) -> float:
         """Data and priors of a light of parameters [M, 3], albedo and, once highlights count, specular terms projected
@@ -266,7 +271,7 @@ class LinearisedFit:
             irradiance, reflection = transport.forward(state.light)
         if changed > _CONVERGED:
             specular_fit = SpecularFit(settings, state, self.errors, irradiance, reflection, None, self.weight,
-                                       self.evidence)
+                                       self.evidence, self.specular_fit.design_effect)
             albedo = self._albedo(state, irradiance, specular_fit.highlights)
             state = replace(_with_albedo(state, albedo), specular=float(np.clip(specular_fit.best[0], *SPECULAR_RANGE)))
             return ResolvedFit(state, transport, irradiance, reflection, albedo, changed)
@@ -274,14 +279,17 @@ class LinearisedFit:
         log_albedo, log_irradiance, _ = problem.mean_on_skin(albedo, irradiance, transport)
         highlights = None
         if self.highlights_count:
-            highlights = measure_highlights(self.errors, irradiance, reflection, self.weight)
+            highlights = measure_highlights(self.errors, irradiance, reflection, self.weight,
+                                            self.specular_fit.design_effect)
         relative = problem.relative_light(irradiance)
         chart = problem.capture.chart
         if chart is not None:
             light = np.split(state.light, len(relative))[chart.light]
             chart = chart.log_factor(light, np.exp(log_albedo + log_irradiance + relative[chart.light]))
+        brightest = np.log(np.quantile(albedo[:, torch.from_numpy(problem.capture.skin), 0].numpy(), BRIGHTEST, axis=1))
         log_factor, specular = resolve_scale(
-            log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart, relative
+            log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart, relative,
+            brightest,
         )
         factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]
         irradiance, reflection = irradiance * factor, reflection * factor

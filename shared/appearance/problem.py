@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -40,6 +41,9 @@ from shared.rendering.transfer import Transfer, nearest_points
 Value = TypeVar("Value")
 
 _POINTS_PER_BLOCK = 512
+
+PATCH_MM = 50.0
+"""Of skin whose errors of the model count as one: a cheek, half a forehead."""
 
 
 @dataclass(frozen=True)
@@ -202,6 +206,12 @@ class AppearanceProblem:
         table = SpecularTransfer(capture.points.normals, capture.transfer.visibility(), capture.directions)
         return AppearanceProblem(capture, self.settings, self.errors.take(index), table, self.node_to_point,
                                  self.skin_prior, self.direct[index], self.bounces.take(index))
+
+    @cached_property
+    def patches(self) -> np.ndarray:
+        """[P] int: the patch of skin that each point lies in, a cube of PATCH_MM."""
+        cubes = np.floor(self.capture.points.positions / PATCH_MM).astype(int)
+        return np.unique(cubes, axis=0, return_inverse=True)[1].ravel()
 
     # ------------------------------------------------------------------ states
     def uniform_start(self) -> AppearanceState:

@@ -3,15 +3,19 @@
 Albedo is a weighted least-squares solution per point and channel. With the roughness linearised highlights are
 x0 S + x1 (s S'), with S the reflection at intensity 1 and S' its derivative by the logarithm of the roughness at the
 present roughness, s the present intensity, x0 the new one and x1 the change of the log roughness: linear in both, each
-of which has a normal prior.
+of which has a normal prior. What the model cannot follow (another lobe than GGX, a light not quite so, hair) is alike
+all over a patch of skin and not noise; how much more the patches disagree than samples would is the design effect, by
+which the samples count less against the priors.
 
-References: [Golub1973] and [Kaufman1975] (variable projection).
+References: [Golub1973] and [Kaufman1975] (variable projection); [Liang1986] (covariance from the clusters' own sums);
+[Kish1965] (design effect).
 """
 
 from __future__ import annotations
 
 import numpy as np
 import torch
+from scipy.linalg import eigh
 
 from shared.appearance.albedo_scale import Highlights
 from shared.appearance.problem import AppearanceSettings, AppearanceState
@@ -22,8 +26,9 @@ ALBEDO_PULL = 25.0
 """Precision of the prior on a point's albedo: a standard deviation of 0.2."""
 SPECULAR_RANGE = (0.0, 2.0)
 """Of the specular intensity: at the upper end the reflectance at normal incidence is 0.08, twice skin's."""
-ROUGHNESS_RANGE, ROUGHNESS_SPREAD = (0.1, 0.7), 0.35
-"""Of skin; the spread is the standard deviation of the prior on its logarithm, about where the fit starts."""
+ROUGHNESS_RANGE, ROUGHNESS_SPREAD = (0.1, 0.7), 0.15
+"""Of skin; the spread is the standard deviation of the prior on its logarithm, about where the fit starts: two of them
+reach from 0.33 to 0.61, oily to powdered skin as renderers have it."""
 NEAR_END = 0.01
 """Share of its range within which a parameter counts as at the end of it."""
 LARGEST_ROUGHNESS_STEP = 0.08
@@ -61,17 +66,22 @@ def project_off_albedo(values: torch.Tensor, irradiance: torch.Tensor, weight: t
 
 
 def measure_highlights(
-    errors: SampleErrors, irradiance: torch.Tensor, reflection: torch.Tensor, weight: torch.Tensor
+    errors: SampleErrors,
+    irradiance: torch.Tensor,
+    reflection: torch.Tensor,
+    weight: torch.Tensor,
+    design_effect: float = 1.0,
 ) -> Highlights:
     """What the samples say about the specular intensity, per channel, with albedo projected out, under irradiance and
-    reflection, samples of weight, all [3, P, F]."""
+    reflection, samples of weight, all [3, P, F]; design_effect: by which they count less, see SpecularFit."""
     weight = weight * errors.fitted
     pure = project_off_albedo(reflection, irradiance, weight)
     moment = (weight * pure * errors.colours).sum((1, 2))
     curvature = (weight * pure * reflection).sum((1, 2))
     share = (weight * errors.colours).sum((1, 2)) / (weight * reflection).sum((1, 2))
     intensity = (moment / curvature.clamp_min(1e-12)).double().numpy()
-    return Highlights(intensity, curvature.double().numpy() * errors.evidence(weight), share.double().numpy())
+    precision = curvature.double().numpy() * errors.evidence(weight) / design_effect
+    return Highlights(intensity, precision, share.double().numpy())
 
 
 def changed_roughness(roughness: float, change: float) -> float:
@@ -82,12 +92,13 @@ def changed_roughness(roughness: float, change: float) -> float:
 
 
 class SpecularFit:
-    """Specular intensity and roughness as samples and priors together have them, under irradiance and reflection
-    [3, P, F], and slope, S', None where the roughness is not sought; state: whose intensity and roughness are
-    linearised about; weight [3, P, F] of the samples, evidence: see SampleErrors.
+    """Specular intensity and roughness as samples and priors together have them, under irradiance and reflection, and
+    slope, S', all [3, P, F], the last None where the roughness is not sought; state: whose intensity and roughness are
+    linearised about; weight [3, P, F] of the samples, evidence: see SampleErrors; design_effect: by which
+    the priors count more.
 
     best: the intensity and, where it is sought, the change of the log roughness; unlikely: what the priors say against
-    them; highlights [3, P, F]: theirs. slope [3, P, F]: derivative of the reflection by the log roughness.
+    them, so counted; highlights [3, P, F]: theirs.
     """
 
     def __init__(
@@ -100,16 +111,28 @@ class SpecularFit:
         slope: torch.Tensor | None,
         weight: torch.Tensor,
         evidence: float,
+        design_effect: float = 1.0,
     ):
-        self._weight, self._evidence = weight, evidence
+        self._weight, self._evidence, self.design_effect = weight, evidence, design_effect
         shown = [reflection] if slope is None else [reflection, state.specular * slope]
         mean, precision = (values[: len(shown)] for values in _prior(settings, state))
         self._pure = [project_off_albedo(one, irradiance, weight) for one in shown]
         curvature, moment = np.array([self._moments(one) for one in shown]), self._moments(errors.colours)
+        precision = precision * design_effect
         self._known = evidence * curvature + np.diag(precision)
         self.best = np.linalg.solve(self._known, evidence * moment + precision * mean)
         self.unlikely = 0.5 * float((precision * np.square(self.best - mean)).sum())
         self.highlights = sum(float(x) * one for x, one in zip(self.best, shown, strict=True))
+
+    def design_effect_of(self, errors: SampleErrors, irradiance: torch.Tensor, patches: np.ndarray) -> float:
+        """By what factor the pulls of patches of skin, patches [P] int, at intensity and roughness vary more than those
+        of independent samples would, at least 1: of that combination of both in which they do most. irradiance
+        [3, P, F]; errors: those that it was fitted to."""
+        left = project_off_albedo(errors.colours - self.highlights, irradiance, self._weight)
+        pulls = self._evidence * np.stack([(self._weight * pure * left).sum((0, 2)).numpy() for pure in self._pure], 1)
+        of_patches = np.stack([np.bincount(patches, own) for own in pulls.T], 1)
+        of_patches -= of_patches.mean(0)
+        return max(1.0, float(eigh(of_patches.T @ of_patches, self._known, eigvals_only=True)[-1]))
 
     def _moments(self, values: torch.Tensor) -> np.ndarray:
         return np.array([float((self._weight * pure * values).sum()) for pure in self._pure])

@@ -59,6 +59,7 @@ REFERENCES = {
         "2019.",
     "Kaufman1975":
         "Kaufman, A variable projection method for solving separable nonlinear least squares problems. BIT 15, 1975.",
+    "Kish1965": "Kish, Survey Sampling. Wiley 1965.",
     "Kroeger2016": "Kroeger et al., Fast Optical Flow using Dense Inverse Search. ECCV 2016.",
     "Laine2020": "Laine et al., Modular Primitives for High-Performance Differentiable Rendering. SIGGRAPH Asia 2020.",
     "Lam1985": "Lam, Metamerism and Colour Constancy. PhD thesis, University of Bradford, 1985.",
@@ -72,6 +73,8 @@ REFERENCES = {
     "Levenberg1944":
         "Levenberg, A Method for the Solution of Certain Non-Linear Problems in Least Squares. Quarterly of Applied "
         "Mathematics 2, 1944.",
+    "Liang1986":
+        "Liang, Zeger, Longitudinal Data Analysis Using Generalized Linear Models. Biometrika 73, 1986.",
     "Loop1987": "Loop, Smooth Subdivision Surfaces Based on Triangles. Master's thesis, University of Utah, 1987.",
     "Mccamy1976":
         "McCamy, Marcus, Davidson, A Color-Rendition Chart. Journal of Applied Photographic Engineering 2, 1976.",

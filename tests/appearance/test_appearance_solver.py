@@ -207,9 +207,12 @@ def test_gauss_newton_product_is_symmetric_and_positive(truth, settings):
     size = (a * linear.product(a)).sum()
     assert size > 0
     assert (a * linear.product(b)).sum() == pytest.approx((b * linear.product(a)).sum(), abs=3e-3 * size)
-    # What only scales the light is absorbed by the albedo.
-    scale = np.ones((6 * 6**2, 3))
-    assert abs((scale * linear.product(scale)).sum()) < 3e-3 * size
+    # What only scales the light is absorbed by the albedo, and by the intensity as far as its prior lets it.
+    scale, resistance = np.ones((6 * 6**2, 3)), 0.0
+    if linear.specular_fit is not None:
+        mean, sigma = settings.specular_prior
+        resistance = linear.specular_fit.design_effect * (linear.state.specular / (mean * sigma)) ** 2
+    assert abs((scale * linear.product(scale)).sum()) < 3e-3 * size + resistance
 
 
 def test_steps_lower_the_cost_and_keep_the_mean_irradiance(matte):
@@ -256,6 +259,35 @@ def test_intensity_and_roughness_are_joint_least_squares(truth):
     certain = replace(GLOSSY, specular_prior=(0.7, 1e-6))
     fit = SpecularFit(certain, state, errors, light, reflection, None, weight, 1e3)
     assert fit.best == pytest.approx([0.7], abs=1e-3)
+
+
+def test_errors_that_a_patch_of_skin_shares_count_once(truth):
+    """Noise leaves the samples what they are; a highlight that each patch has otherwise makes them count less, and the
+    priors more: the intensity stays closer to skin's."""
+    capture, albedo, _ = truth
+    problem, state, light, reflection = truly_lit(capture, GLOSSY)
+    transport = problem.transport(state)
+    slope = transport.roughness_slope(transport.lobes.slopes(), state.light, light)
+    diffuse = torch.from_numpy(albedo.T.astype(np.float32))[..., None] * light
+    weight = problem.errors.weights(None) * problem.errors.fitted
+    rng, patches = np.random.default_rng(0), problem.patches
+    assert len(np.unique(patches)) >= 4
+    wanted = 1.2
+
+    def fitted(error: np.ndarray) -> SpecularFit:
+        colours = diffuse + wanted * reflection + torch.from_numpy(error.astype(np.float32))
+        errors = replace(problem.errors, colours=colours)
+        given = (GLOSSY, state, errors, light, reflection, slope, weight, 1.0)
+        return SpecularFit(*given, SpecularFit(*given).design_effect_of(errors, light, patches))
+
+    shape = tuple(reflection.shape)
+    noisy = fitted(rng.normal(0.0, 1.0, shape) / np.sqrt(problem.errors.precision.numpy()))
+    other = rng.choice([-0.8, 0.8], patches.max() + 1)[patches]
+    uneven = fitted(other[None, :, None] * reflection.numpy())
+    assert noisy.design_effect < 4.0
+    assert uneven.design_effect > 5.0 * noisy.design_effect
+    towards_prior = [abs(fit.best[0] - GLOSSY.specular_prior[0]) for fit in (noisy, uneven)]
+    assert towards_prior[1] < towards_prior[0]
 
 
 def test_light_between_surfaces_that_send_everything_on_comes_to_an_end(truth):

@@ -19,7 +19,7 @@ from toy_capture import (
 
 from shared.appearance.fit import fit_all_points, fit_appearance
 from shared.appearance.problem import AppearanceSettings
-from shared.appearance.projection import changed_roughness
+from shared.appearance.projection import ROUGHNESS_RANGE, changed_roughness, reached_end
 from shared.contract.records import SOLVE
 from shared.geometry.mesh import normalised
 from shared.geometry.transforms import fibonacci_sphere
@@ -41,7 +41,7 @@ def after_shaping(solution):
 @pytest.fixture(scope="module")
 def solution(truth):
     capture, _, _ = truth
-    settings = AppearanceSettings(resolutions=(8,), steps=7, noise=(0.003, 0.01), roughness=0.45)
+    settings = AppearanceSettings(resolutions=(8,), steps=12, noise=(0.003, 0.01), roughness=0.45)
     return fit_appearance(capture, settings)
 
 
@@ -133,26 +133,27 @@ def test_highlights_join_a_light_that_was_found_without_them():
 
 
 def test_highlights_wait_while_a_light_of_fewer_numbers_takes_shape():
-    """A hard lamp that harmonics cannot show: judged at once in what is left of it, highlights end as narrow as can be,
-    and the blue channel's scale is off by half."""
+    """A hard lamp that harmonics cannot show, whose highlights are narrower than the skin's; the scale of no channel
+    follows them."""
     capture, albedo, _ = make_truth(lights=(hard_light,))
     settings = AppearanceSettings("harmonics_2", (8,), steps=12, noise=(0.003, 0.01), roughness=0.45)
     found = fit_appearance(capture, settings)
     first = [record["light"] for record in found.iterations].index("harmonics_2")
     shaping = [record["shaping"] for record in found.iterations[first:]]
     assert shaping[0] and not shaping[-1] and sorted(shaping, reverse=True) == shaping
-    assert found.state.roughness > 0.3
-    assert np.abs(np.log(np.median(found.state.albedo / albedo, axis=0))).max() < 0.25
+    assert not reached_end(found.state.roughness, ROUGHNESS_RANGE) and found.highlights_count
+    assert found.held_out < 0.011
+    assert np.abs(np.log(np.median(found.state.albedo / albedo, axis=0))).max() < 0.2
 
 
 def test_a_fit_goes_on_from_a_solution(truth, solution):
-    """From the solution of the same capture: the last resolution alone, until the scale rests, to the same residual or
-    below."""
+    """From the solution of the same capture: the last resolution alone, until the scale rests, to the residual at which
+    that came to rest or below."""
     settings = AppearanceSettings(resolutions=(4, 8), steps=12, noise=(0.003, 0.01), roughness=0.45)
     again = fit_appearance(truth[0], settings, start=solution)
     assert {record["resolution"] for record in again.iterations} == {8}
     assert len(again.iterations) <= 8
-    assert again.held_out < 1.02 * solution.held_out
+    assert again.held_out < 1.01 * solution.iterations[-1]["held_out"]
     without = fit_appearance(truth[0], settings, start=replace(solution, highlights_count=False))
     assert not without.highlights_count and again.highlights_count
 

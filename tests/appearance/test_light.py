@@ -178,6 +178,27 @@ def test_highlights_tell_a_bright_light_from_bright_skin():
     assert (resolve_scale(skin - light, light, stronger, mean)[0] > -np.log(2.0) + 0.05).all()
 
 
+def test_highlights_that_are_not_there_say_little():
+    """An intensity below 0 within its error is a faint highlight, not an infinitely fainter light."""
+    skin = on_the_locus()
+    faint = Highlights(np.array([-0.2, 0.2, 0.4]), np.full(3, 4.0), np.full(3, 10.0))
+    log_factor, specular = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25))
+    assert (np.abs(log_factor) < 0.6).all() and 0.5 < specular < 0.8
+
+
+def test_no_skin_returns_more_than_the_lightest():
+    """Faint highlights ask for a dim light on light skin; its brightest places say how light it can be."""
+    skin = np.log([0.6, 0.4, 0.3])
+    faint = Highlights(np.full(3, 0.2), np.full(3, 1e4), np.full(3, 2.0))
+    free, _ = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25))
+    held, _ = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25), log_brightest=skin + 0.15)
+    assert np.exp(skin + 0.15 - free).max() > 1.0
+    assert np.exp(skin + 0.15 - held).max() < 0.95
+    dark = on_the_locus()
+    unhindered, _ = resolve_scale(dark, np.zeros(3), None, (0.7, 0.25), log_brightest=dark + 0.15)
+    assert np.allclose(unhindered, resolve_scale(dark, np.zeros(3), None, (0.7, 0.25))[0], atol=1e-6)
+
+
 def test_skin_locus_runs_through_the_reference_skins():
     locus = fit_skin_locus()
     luminance = np.log(REFERENCE_SKINS @ LUMINANCE) - locus.mean_log_luminance
