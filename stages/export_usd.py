@@ -23,7 +23,7 @@ from shared.errors import LimnError
 
 STAGE = Stage(
     name="export_usd",
-    version=6,
+    version=7,
     help="The head as USD, glTF, OBJ and EXR, with a report to judge it by.",
     inputs=("sample_frames", "track_landmarks", "init_albedo", "inverse_render"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -35,7 +35,7 @@ STAGE = Stage(
         Output("head.usdz", "all of head.usda and its textures in one file; absent when usdz is off", optional=True),
         Output("head.glb", "mesh, textures, lens and motion as binary glTF; absent when glb is off", unit="m",
                optional=True),
-        Output("mesh.obj", "the mesh with its UVs; groups for head and eyes where the gaze is known", unit="mm",
+        Output("mesh.obj", "the mesh with its UVs; groups for head and eyes", unit="mm",
                space="head"),
         Output("maps/*.exr", "texture maps, v up", space="uv", colour_space="in each file"),
         Output("maps/png/*.png", "integer copies of the maps; absent unless png_copies", space="uv", optional=True),
@@ -87,15 +87,15 @@ def read_maps(folder: Path) -> dict:
     return maps | {"specular_ior": modulated_ior(maps["specular_intensity"])}
 
 
-def read_eyes(job: Job, mesh, poses: dict) -> tuple:
-    """The right and the left Eyeball, which the asset shows as meshes of their own; none where the gaze was not solved
-    or the mesh has no eyes."""
+def read_eyeballs(job: Job, mesh) -> tuple:
+    """The right and the left Eyeball of the mesh, which are groups of mesh.obj and, where their gaze is known, meshes
+    of their own in the asset; none where the mesh has no eyes."""
     from shared.geometry.eyeballs import eyeballs_of
     from shared.geometry.surface import Surface
     from shared.io.arrays import load_arrays, read_json
 
     segment = load_arrays(job.input("inverse_render") / "mesh.npz").get("face_segment")
-    if "eye_turn" not in poses or segment is None:
+    if segment is None:
         return ()
     names = read_json(job.input("track_landmarks") / "tracking.json")["segments"]
     return eyeballs_of(Surface(mesh, segment, tuple(names))) or ()
@@ -168,16 +168,16 @@ def describe_asset(job: Job, mesh, eyes, capture, frames, writer, lamp):
                      version=str(STAGE.version), metadata=metadata)
 
 
-def write_assets(job: Job, asset, poses: dict, maps: dict, envmap) -> None:
-    """mesh.obj, poses.npz, head.usda and its layers; when wished, head.usdz and head.glb. envmap [H, 2 H, 3]: what the
-    asset's dome shows, linear Rec.709."""
+def write_assets(job: Job, asset, eyeballs, poses: dict, maps: dict, envmap) -> None:
+    """mesh.obj, poses.npz, head.usda and its layers; when wished, head.usdz and head.glb. eyeballs: the
+    groups of mesh.obj beside the head's; envmap [H, 2 H, 3]: what the asset's dome shows, linear Rec.709."""
     from shared.io.arrays import save_arrays
     from shared.io.gltf import write_glb
     from shared.io.meshes import write_obj
     from shared.io.usd import write_head_usda
     from shared.io.usdz import write_head_usdz
 
-    write_obj(job.out / "mesh.obj", asset.mesh, asset.eyes)
+    write_obj(job.out / "mesh.obj", asset.mesh, eyeballs)
     kept = {name: poses[name] for name in ("camera_from_head", "frame_index", "intrinsics", "gaze") if name in poses}
     save_arrays(job.out / "poses.npz", **kept)
     write_head_usda(job.out, asset)
@@ -328,9 +328,10 @@ def run(job: Job) -> None:
     if lamp is not None:
         far = read_exr(solved / "envmap_far.exr")
         writer.write_colour(job.out / "envmap_far.exr", far, "radiance, clip maximum 1", latlong=True)
-    eyes = read_eyes(job, mesh, poses)
+    eyeballs = read_eyeballs(job, mesh)
+    eyes = eyeballs if "eye_turn" in poses else ()
     asset = describe_asset(job, mesh, eyes, describe_capture(job, poses, frames), frames, writer, lamp)
-    write_assets(job, asset, poses, maps, far)
+    write_assets(job, asset, eyeballs, poses, maps, far)
     views = render_views(job, writer, mesh, eyes, maps, envmap, poses, frames, solve)
     record = run_record(job, mesh, solve, time.perf_counter() - start)
     write_json(job.out / "run.json", record)

@@ -136,7 +136,7 @@ def test_obj_and_poses_hold_the_eyes(exported):
 
 
 def test_eyes_whose_gaze_is_not_known_stay_in_the_head(tmp_path):
-    """Without a gaze, the mesh with eyes is exported as one."""
+    """Without a gaze, the mesh with eyes is exported as one; only mesh.obj says which faces they are."""
     work = write_toy_work(tmp_path / "work", eyes=True)
     poses = load_arrays(work / "inverse_render" / "poses.npz")
     del poses["gaze"], poses["eye_turn"]
@@ -149,7 +149,8 @@ def test_eyes_whose_gaze_is_not_known_stay_in_the_head(tmp_path):
     assert [prim.GetName() for prim in root.GetPrimAtPath("geo").GetChildren()] == ["head"]
     assert [prim.GetName() for prim in root.GetPrimAtPath("mtl").GetChildren()] == ["skin"]
     assert root.GetPrimAtPath("geo").IsA(UsdGeom.Scope) and "gaze" not in load_arrays(job.out / "poses.npz")
-    assert not any(line.startswith("g ") for line in (job.out / "mesh.obj").read_text().splitlines())
+    groups = [line[2:] for line in (job.out / "mesh.obj").read_text().splitlines() if line.startswith("g ")]
+    assert set(groups) == {"head", "eye_right", "eye_left"}
 
 
 def test_eyes_that_never_open_look_straight_ahead(tmp_path):
