@@ -359,6 +359,10 @@ def robust_weight(
     """Cauchy weight [n, 3] of each sample given the model [n, 3]; 0 where a clipped or crushed sample's bound is
     inactive.
 
+    A frame shows a texel in all channels or in none, so the channel that fits worst decides, and of clipped or crushed
+    ones those that are neither: where a neck whose red burns out is hidden by a collar in some frames, red would know
+    the collar alone, and green and blue the neck.
+
     information [T]: precision of the model's log albedo; what it leaves open does not lower a sample's weight; shadow
     [n, 3]: standard deviation of the model since borders of shadows may lie elsewhere; None: of none. scale: of the
     Cauchy loss, in standard deviations.
@@ -376,14 +380,18 @@ _is_inactive = compiled_part(is_inactive)
 def _weigh_samples(model, colours, saturation, rows, information, shadow, numbers, weight):
     absolute, relative, prior, tightness = numbers
     for i in range(len(model)):
-        openness = np.float32(1.0) / (information[rows[i]] + prior)
+        openness, least, measured = np.float32(1.0) / (information[rows[i]] + prior), np.float32(1.0), False
         for c in range(3):
             error, sigma = model[i, c] - colours[i, c], absolute + relative * colours[i, c]
-            if _is_inactive(saturation[i, c], error):
-                weight[i, c] = 0.0
-                continue
             variance = sigma * sigma + model[i, c] * model[i, c] * openness + shadow[i, c] * shadow[i, c]
             weight[i, c] = variance / (variance + tightness * error * error)
+            if saturation[i, c] == 0:
+                least, measured = min(least, weight[i, c]), True
+        for c in range(3):
+            if _is_inactive(saturation[i, c], model[i, c] - colours[i, c]):
+                weight[i, c] = 0.0
+            elif measured:
+                weight[i, c] = least
 
 
 def pooled_specular(

@@ -204,6 +204,21 @@ def test_scatter_is_what_frames_contradict_each_other_by():
     assert (variance[3] == 0.0).all()
 
 
+def test_channels_of_a_sample_show_the_same_thing():
+    """A neck whose red burns out, behind a dark collar in a third of the frames: of red the first pass knows the collar
+    alone. Green and blue tell which frames show the neck, and their bounds bring red up to it."""
+    neck, collar, frames = np.array([1.3, 0.6, 0.4]), np.array([0.05, 0.04, 0.04]), 30
+    shows_neck = np.arange(frames) % 3 > 0
+    truth = np.where(shows_neck[:, None], neck, collar)
+    colours, saturation = np.minimum(truth, 1.0), np.where(truth > 1.0, 1, 0).astype(np.int8)
+    samples = TexelSamples(np.zeros(frames, int), colours, np.ones(frames), saturation)
+    first = np.array([collar[0], *np.median(colours[:, 1:], axis=0)])
+    weight = robust_weight(np.tile(first, (frames, 1)), samples, NOISE, np.full(1, 1e4))
+    assert weight[shows_neck].min() > 0.95 and weight[~shows_neck].max() < 0.1
+    red = (weight[:, 0] * colours[:, 0]).sum() / weight[:, 0].sum()
+    assert 0.9 < red <= 1.0
+
+
 def test_robust_weights():
     colours = np.full((4, 3), 0.5, np.float32)
     model = colours + np.array([[0.0], [0.02 * 2.5], [5.0], [-0.2]], np.float32)
