@@ -35,8 +35,7 @@ STAGE = Stage(
         Output("head.usdz", "all of head.usda and its textures in one file; absent when usdz is off", optional=True),
         Output("head.glb", "mesh, textures, lens and motion as binary glTF; absent when glb is off", unit="m",
                optional=True),
-        Output("mesh.obj", "the mesh with its UVs; groups for head and eyes", unit="mm",
-               space="head"),
+        Output("mesh.obj", "the mesh with its UVs; groups for head and eyes", unit="mm", space="head"),
         Output("maps/*.exr", "texture maps, v up", space="uv", colour_space="in each file"),
         Output("maps/png/*.png", "integer copies of the maps; absent unless png_copies", space="uv", optional=True),
         Output("envmap.exr", "the light, lat-long", space="world", colour_space="in the file"),
@@ -169,8 +168,8 @@ def describe_asset(job: Job, mesh, eyes, capture, frames, writer, lamp):
 
 
 def write_assets(job: Job, asset, eyeballs, poses: dict, maps: dict, envmap) -> None:
-    """mesh.obj, poses.npz, head.usda and its layers; when wished, head.usdz and head.glb. eyeballs: the
-    groups of mesh.obj beside the head's; envmap [H, 2 H, 3]: what the asset's dome shows, linear Rec.709."""
+    """mesh.obj, poses.npz, head.usda and its layers; when wished, head.usdz and head.glb. eyeballs: the groups of
+    mesh.obj beside the head's; envmap [H, 2 H, 3]: what the asset's dome shows, linear Rec.709."""
     from shared.io.arrays import save_arrays
     from shared.io.gltf import write_glb
     from shared.io.meshes import write_obj

@@ -137,8 +137,8 @@ def resolve_scale(
     log_irradiance [3] are the skin's present means; specular_prior: mean of s and standard deviation of its logarithm;
     chart: the log factor [3] on the light that a colour chart asks for, and its covariance [3, 3]; relative_light: see
     scale_prior; log_brightest [3]: log of the skin's present albedo at the quantile BRIGHTEST, None: it is not asked.
-    With a chart the highlights give s alone: on the scale their range has little to add, and the model's
-    errors pass for highlights.
+    With a chart the highlights give s alone: on the scale their range has little to add, and the model's errors pass
+    for highlights.
     -> log k [3], and s, the prior's mean without highlights.
     """
     matrix, right = scale_prior(log_albedo + log_irradiance, white_sigma, relative_light=relative_light)

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from scipy.sparse.linalg import LinearOperator, cg
 
-from shared.appearance.albedo_scale import BRIGHTEST, resolve_scale
+from shared.appearance.albedo_scale import resolve_scale
 from shared.appearance.preconditioner import MOST_TEXELS, LightPreconditioner, curvature_of_some
 from shared.appearance.problem import AppearanceProblem, AppearanceState
 from shared.appearance.projection import (
@@ -92,12 +92,10 @@ class LinearisedFit:
         specular_fit, highlights = None, state.specular * reflection
         if highlights_count:
             slope = None if slopes is None else transport.roughness_slope(slopes, light, irradiance)
-            given = (settings, state, errors, irradiance, reflection, slope, weight, evidence)
-            specular_fit = SpecularFit(*given)
-            design_effect = specular_fit.design_effect_of(errors, irradiance, problem.patches)
-            specular_fit = SpecularFit(*given, design_effect)
+            specular_fit = SpecularFit(settings, state, errors, irradiance, reflection, slope, weight, evidence)
+            specular_fit = specular_fit.weighed_by_patches(errors, irradiance, problem.patches)
             highlights = specular_fit.highlights
-            state = replace(state, specular=float(np.clip(specular_fit.best[0], *SPECULAR_RANGE)))
+            state = replace(state, specular=specular_fit.intensity)
         albedo = best_albedo(errors, irradiance, highlights, weight, problem.typical_albedo(state))
         skin, albedo_slope = None, None
         if problem.skin_prior is not None:
@@ -273,7 +271,7 @@ class LinearisedFit:
             specular_fit = SpecularFit(settings, state, self.errors, irradiance, reflection, None, self.weight,
                                        self.evidence, self.specular_fit.design_effect)
             albedo = self._albedo(state, irradiance, specular_fit.highlights)
-            state = replace(_with_albedo(state, albedo), specular=float(np.clip(specular_fit.best[0], *SPECULAR_RANGE)))
+            state = replace(_with_albedo(state, albedo), specular=specular_fit.intensity)
             return ResolvedFit(state, transport, irradiance, reflection, albedo, changed)
         albedo = self._albedo(state, irradiance, state.specular * reflection)
         log_albedo, log_irradiance, _ = problem.mean_on_skin(albedo, irradiance, transport)
@@ -286,10 +284,9 @@ class LinearisedFit:
         if chart is not None:
             light = np.split(state.light, len(relative))[chart.light]
             chart = chart.log_factor(light, np.exp(log_albedo + log_irradiance + relative[chart.light]))
-        brightest = np.log(np.quantile(albedo[:, torch.from_numpy(problem.capture.skin), 0].numpy(), BRIGHTEST, axis=1))
         log_factor, specular = resolve_scale(
             log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart, relative,
-            brightest,
+            problem.brightest_skin(albedo),
         )
         factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]
         irradiance, reflection = irradiance * factor, reflection * factor

@@ -25,7 +25,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from shared.appearance.albedo_scale import most_likely_irradiance
+from shared.appearance.albedo_scale import BRIGHTEST, most_likely_irradiance
 from shared.appearance.light import FrameLight, LightPriors
 from shared.appearance.light_models import LightModel, make_light_model
 from shared.appearance.observations import Capture
@@ -317,6 +317,10 @@ class AppearanceProblem:
         log_albedo = torch.log((weight * albedo).sum((1, 2)) / total)
         gauge = transport.irradiance_adjoint((weight / total / mean[:, None, None]).expand_as(irradiance))
         return log_albedo.double().numpy(), torch.log(mean).double().numpy(), gauge
+
+    def brightest_skin(self, albedo: torch.Tensor) -> np.ndarray:
+        """[3]: log of the skin points' albedo [3, P, 1] at the quantile BRIGHTEST."""
+        return np.log(np.quantile(albedo[:, torch.from_numpy(self.capture.skin), 0].numpy(), BRIGHTEST, axis=1))
 
     def relative_light(self, irradiance: torch.Tensor) -> np.ndarray:
         """[L, 3]: log of the skin's mean irradiance [3, P, F] in the frames of each light, relative to that in all

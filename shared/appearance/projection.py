@@ -13,6 +13,8 @@ References: [Golub1973] and [Kaufman1975] (variable projection); [Liang1986] (co
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 import torch
 from scipy.linalg import eigh
@@ -94,8 +96,8 @@ def changed_roughness(roughness: float, change: float) -> float:
 class SpecularFit:
     """Specular intensity and roughness as samples and priors together have them, under irradiance and reflection, and
     slope, S', all [3, P, F], the last None where the roughness is not sought; state: whose intensity and roughness are
-    linearised about; weight [3, P, F] of the samples, evidence: see SampleErrors; design_effect: by which
-    the priors count more.
+    linearised about; weight [3, P, F] of the samples, evidence: see SampleErrors; design_effect: by which the
+    priors count more.
 
     best: the intensity and, where it is sought, the change of the log roughness; unlikely: what the priors say against
     them, so counted; highlights [3, P, F]: theirs.
@@ -113,21 +115,32 @@ class SpecularFit:
         evidence: float,
         design_effect: float = 1.0,
     ):
-        self._weight, self._evidence, self.design_effect = weight, evidence, design_effect
-        shown = [reflection] if slope is None else [reflection, state.specular * slope]
-        mean, precision = (values[: len(shown)] for values in _prior(settings, state))
-        self._pure = [project_off_albedo(one, irradiance, weight) for one in shown]
-        curvature, moment = np.array([self._moments(one) for one in shown]), self._moments(errors.colours)
-        precision = precision * design_effect
-        self._known = evidence * curvature + np.diag(precision)
-        self.best = np.linalg.solve(self._known, evidence * moment + precision * mean)
-        self.unlikely = 0.5 * float((precision * np.square(self.best - mean)).sum())
-        self.highlights = sum(float(x) * one for x, one in zip(self.best, shown, strict=True))
+        self._weight, self._evidence = weight, evidence
+        self._shown = [reflection] if slope is None else [reflection, state.specular * slope]
+        self._mean, self._precision = (values[: len(self._shown)] for values in _prior(settings, state))
+        self._pure = [project_off_albedo(one, irradiance, weight) for one in self._shown]
+        self._curvature = evidence * np.array([self._moments(one) for one in self._shown])
+        self._moment = evidence * self._moments(errors.colours)
+        self._solve(design_effect)
 
-    def design_effect_of(self, errors: SampleErrors, irradiance: torch.Tensor, patches: np.ndarray) -> float:
-        """By what factor the pulls of patches of skin, patches [P] int, at intensity and roughness vary more than those
-        of independent samples would, at least 1: of that combination of both in which they do most. irradiance
-        [3, P, F]; errors: those that it was fitted to."""
+    def _solve(self, design_effect: float) -> None:
+        self.design_effect = design_effect
+        precision, mean = self._precision * design_effect, self._mean
+        self._known = self._curvature + np.diag(precision)
+        self.best = np.linalg.solve(self._known, self._moment + precision * mean)
+        self.unlikely = 0.5 * float((precision * np.square(self.best - mean)).sum())
+        self.highlights = sum(float(x) * one for x, one in zip(self.best, self._shown, strict=True))
+
+    def weighed_by_patches(self, errors: SampleErrors, irradiance: torch.Tensor, patches: np.ndarray) -> SpecularFit:
+        """The same with the design effect of patches of skin, patches [P] int; errors and irradiance [3, P, F]: those
+        that it was fitted with."""
+        fit = copy(self)
+        fit._solve(self._design_effect_of(errors, irradiance, patches))
+        return fit
+
+    def _design_effect_of(self, errors: SampleErrors, irradiance: torch.Tensor, patches: np.ndarray) -> float:
+        """By what factor the patches' pulls at intensity and roughness vary more than independent samples' would, at
+        least 1: of that combination of both in which they do most."""
         left = project_off_albedo(errors.colours - self.highlights, irradiance, self._weight)
         pulls = self._evidence * np.stack([(self._weight * pure * left).sum((0, 2)).numpy() for pure in self._pure], 1)
         of_patches = np.stack([np.bincount(patches, own) for own in pulls.T], 1)
@@ -141,6 +154,11 @@ class SpecularFit:
         """values [3, P, F], free of albedo, minus what a change of intensity and roughness would absorb."""
         along = np.linalg.solve(self._known / self._evidence, self._moments(values))
         return values - sum(float(x) * pure for x, pure in zip(along, self._pure, strict=True))
+
+    @property
+    def intensity(self) -> float:
+        """Within its range."""
+        return float(np.clip(self.best[0], *SPECULAR_RANGE))
 
     @property
     def change_of_roughness(self) -> float:

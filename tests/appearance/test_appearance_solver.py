@@ -277,8 +277,8 @@ def test_errors_that_a_patch_of_skin_shares_count_once(truth):
     def fitted(error: np.ndarray) -> SpecularFit:
         colours = diffuse + wanted * reflection + torch.from_numpy(error.astype(np.float32))
         errors = replace(problem.errors, colours=colours)
-        given = (GLOSSY, state, errors, light, reflection, slope, weight, 1.0)
-        return SpecularFit(*given, SpecularFit(*given).design_effect_of(errors, light, patches))
+        fit = SpecularFit(GLOSSY, state, errors, light, reflection, slope, weight, evidence=1.0)
+        return fit.weighed_by_patches(errors, light, patches)
 
     shape = tuple(reflection.shape)
     noisy = fitted(rng.normal(0.0, 1.0, shape) / np.sqrt(problem.errors.precision.numpy()))
