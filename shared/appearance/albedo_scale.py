@@ -1,8 +1,8 @@
-"""The factor per colour channel between light and albedo: what the clip cannot say, said by stated priors, and by a
-colour chart where one is in view.
+"""The factor per colour channel between light and albedo: what the clip cannot say, said by stated priors, and by the
+whites of the eyes or a colour chart where they are in view.
 
 Twice the light on half the albedo gives the same diffuse picture. Three statements fix the factor, each a normal
-distribution over logarithms, and a chart is another (chart_scale):
+distribution over logarithms, and the whites of the eyes (eye_whites) and a chart (chart_scale) are others:
 
 - skin's luminance: log Y is normal with the median and the spread of reference skins of all tones;
 - skin's chroma lies on the locus of measured skins: log R/G and log B/G are linear in log Y, sigma as found there;
@@ -129,6 +129,7 @@ def resolve_scale(
     chart: tuple[np.ndarray, np.ndarray] | None = None,
     relative_light: np.ndarray | None = None,
     log_brightest: np.ndarray | None = None,
+    whites: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, float]:
     """The factor on the light per channel and the specular intensity that are jointly most likely.
 
@@ -136,16 +137,17 @@ def resolve_scale(
     scale that diffuse skin cannot: with the light multiplied by k, channel c wants s k_c = t_c. log_albedo,
     log_irradiance [3] are the skin's present means; specular_prior: mean of s and standard deviation of its logarithm;
     chart: the log factor [3] on the light that a colour chart asks for, and its covariance [3, 3]; relative_light: see
-    scale_prior; log_brightest [3]: log of the skin's present albedo at the quantile BRIGHTEST, None: it is not asked.
+    scale_prior; log_brightest [3]: log of the skin's present albedo at the quantile BRIGHTEST, None: it is not asked;
+    whites: as chart, of the whites of the eyes.
     With a chart the highlights give s alone: on the scale their range has little to add, and the model's errors pass
     for highlights.
     -> log k [3], and s, the prior's mean without highlights.
     """
     matrix, right = scale_prior(log_albedo + log_irradiance, white_sigma, relative_light=relative_light)
-    if chart is not None:
-        whitening = np.linalg.inv(np.linalg.cholesky(chart[1]))
+    for wanted, covariance in filter(None, (chart, whites)):
+        whitening = np.linalg.inv(np.linalg.cholesky(covariance))
         matrix = np.concatenate([matrix, whitening])
-        right = np.concatenate([right, whitening @ (log_irradiance + chart[0])])
+        right = np.concatenate([right, whitening @ (log_irradiance + wanted)])
     mean, sigma = specular_prior
     alone = np.linalg.lstsq(matrix, right - matrix @ log_irradiance, rcond=None)[0]
     ceiling = np.log(REFERENCE_SKINS.max())

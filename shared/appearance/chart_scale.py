@@ -216,18 +216,22 @@ def chart_normals(corners: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarr
     return np.array(normals), -4.0 * np.square(np.array(errors) / CORNER_SIGMA_PX)
 
 
-def describe_scale(chart: ChartStatement | None, skin: np.ndarray) -> dict:
-    """albedo_scale of solve.json: what set the scale, and the skin's albedo [3] under it.
+def describe_scale(chart: ChartStatement | None, skin: np.ndarray, whites: dict | None = None) -> dict:
+    """albedo_scale of solve.json: what set the scale, and the skin's albedo [3] under it; whites: what the whites of
+    the eyes said, None: nothing.
 
     With a chart also what it said: the frames, the irradiance over pi on it, the deviation of its logarithm, and by
-    which factor the albedo would be another by the priors alone (without highlights).
+    which factor the albedo would be another by the priors alone (without highlights and whites).
     """
     priors = "luminance and chroma of reference skins, a light that is white on average"
+    if whites is not None:
+        priors += ", whites of the eyes that are nearly neutral and as bright as usual"
     alone = f"priors: {priors}, and the strength of highlights relative to their usual range"
     described = {
         "method": f"a colour chart in view, and far weaker priors: {priors}" if chart else alone,
         "skin_albedo": np.round(skin, 4).tolist(),
         "skin_luminance": round(float(skin @ LUMINANCE), 4),
+        **({} if whites is None else {"whites": whites}),
     }
     if chart is None:
         return described

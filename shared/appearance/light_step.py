@@ -286,7 +286,7 @@ class LinearisedFit:
             chart = chart.log_factor(light, np.exp(log_albedo + log_irradiance + relative[chart.light]))
         log_factor, specular = resolve_scale(
             log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart, relative,
-            problem.brightest_skin(albedo),
+            problem.brightest_skin(albedo), problem.said_by_whites(state),
         )
         factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]
         irradiance, reflection = irradiance * factor, reflection * factor

@@ -7,11 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from shared.appearance.chart_scale import ChartStatement
+from shared.appearance.eye_whites import WhitesSeen
 from shared.compute.read_ahead import read_ahead
 from shared.compute.run_context import RunContext
 from shared.geometry.transforms import camera_centres, world_from_head
 from shared.imaging.frame_index import frames_of_lights, spread_frames
 from shared.imaging.image_sampling import Samples, SurfaceViewer, sample_points_in_frames
+from shared.imaging.turning_eyes import TurningEyes
 from shared.imaging.views import Views
 from shared.rendering.near_lamp import SeenLamp
 from shared.rendering.precomputed_transfer import PrecomputedTransfer
@@ -28,7 +30,8 @@ class Capture:
     points [P] with samples [P, F] and transfer; nodes and their own transfer; directions [J, 3];
     world_from_head [F, 3, 3]; fitted [F] bool (the other frames are held out); skin [P] bool: where the prior on skin
     reflectance applies; light_index [F]: which light each frame stands in; chart: what a colour chart says about the
-    light's scale; lamp: of the light, where it stands near, None: all of the light is far away.
+    light's scale; lamp: of the light, where it stands near, None: all of the light is far away; whites: the same of
+    places on the whites of the eyes, None where the clip does not show enough of them.
     """
 
     points: Points
@@ -43,6 +46,17 @@ class Capture:
     light_index: np.ndarray
     chart: ChartStatement | None = None
     lamp: SeenLamp | None = None
+    whites: Capture | None = None
+
+    def traced_anew(self, precomputed: PrecomputedTransfer) -> Capture:
+        """The same with another transfer."""
+        whites = None if self.whites is None else self.whites.traced_anew(precomputed)
+        return replace(self, transfer=precomputed.trace(self.points), node_transfer=precomputed.node_transfer,
+                       whites=whites)
+
+    def under_lamp(self, lamp: SeenLamp) -> Capture:
+        """The same with a lamp that stands near."""
+        return replace(self, lamp=lamp, whites=None if self.whites is None else replace(self.whites, lamp=lamp))
 
     @property
     def frames_of_lights(self) -> list[np.ndarray]:
@@ -85,16 +99,20 @@ def build_capture(
     skin: np.ndarray,
     count: int,
     context: RunContext,
+    eyes: TurningEyes | None = None,
 ) -> Capture:
     """Samples and transfer of at most count vertices in all views.
 
     moves: what moves against the light, which is not the views' where the light goes along; skin [V] bool: vertices
     that may be chosen, to all of which the prior on skin reflectance applies. Vertices seen in fewer than
-    MINIMUM_FRAMES fitted frames or deep inside the mesh are left out.
+    MINIMUM_FRAMES fitted frames or deep inside the mesh are left out. eyes: those of the mesh, whose whites tell of the
+    light, None: they are not looked at.
     """
     front = skin & face_front(viewer, views.camera_from_head, 0.2)
     index = spread_vertices(viewer.layout, count, front)
     pictures = read_ahead(map(views.picture, context.progress(range(len(views)), "sampling the pictures")))
+    whites = None if eyes is None or views.lids_px is None else WhitesSeen(eyes, viewer.scene, views)
+    pictures = pictures if whites is None else whites.looked_at(pictures)
     samples = sample_points_in_frames(viewer, index, pictures, views.camera_from_head, views.intrinsics)
     # Of very few frames, chosen to cover the face, no point is seen in all.
     least = min(MINIMUM_FRAMES, -(-2 * int(views.fitted.sum()) // 3))
@@ -103,7 +121,7 @@ def build_capture(
     transfer = precomputed.trace(points, lambda batches: context.progress(batches, "tracing visibility"))
     shallow = np.nonzero(transfer.blocked < DEEP)[0]
     chosen = np.nonzero(seen)[0][shallow]
-    return Capture(
+    found = Capture(
         points=points.take(shallow),
         samples=samples.points(chosen),
         transfer=transfer.take(shallow),
@@ -115,3 +133,14 @@ def build_capture(
         skin=np.ones(len(chosen), bool),
         light_index=views.light_index,
     )
+    return found if whites is None else replace(found, whites=_of_whites(whites, found, precomputed))
+
+
+def _of_whites(whites: WhitesSeen, capture: Capture, precomputed: PrecomputedTransfer) -> Capture | None:
+    """What the whites show in a capture's frames, under its light; None where that is too little."""
+    rows, samples = whites.samples(capture.fitted)
+    if not len(rows):
+        return None
+    points = whites.places.take(rows)
+    transfer = precomputed.trace(points)
+    return replace(capture, points=points, samples=samples, transfer=transfer, skin=np.zeros(len(rows), bool))

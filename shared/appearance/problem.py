@@ -26,6 +26,7 @@ import numpy as np
 import torch
 
 from shared.appearance.albedo_scale import BRIGHTEST, most_likely_irradiance
+from shared.appearance.eye_whites import whites_statement
 from shared.appearance.light import FrameLight, LightPriors
 from shared.appearance.light_models import LightModel, make_light_model
 from shared.appearance.observations import Capture
@@ -36,7 +37,7 @@ from shared.compute.threads import share_out
 from shared.rendering.lobes import SpecularTransfer
 from shared.rendering.near_lamp import LampView
 from shared.rendering.shading import Material
-from shared.rendering.transfer import Transfer, nearest_points
+from shared.rendering.transfer import Transfer, nearest_points, node_radiosity
 
 Value = TypeVar("Value")
 
@@ -168,7 +169,8 @@ class Bounces:
 class AppearanceProblem:
     """What stays while states change: the capture, settings, the samples' errors as assumed, the points' lobes as a
     function of the roughness, the point that each node takes its albedo from [K], the prior on skin, or None, the
-    irradiance from each direction, without bounces [P, J], and what bounces go by."""
+    irradiance from each direction, without bounces [P, J], and what bounces go by; whites: that of the whites of the
+    eyes, None where nothing is said of them."""
 
     capture: Capture
     settings: AppearanceSettings
@@ -178,6 +180,7 @@ class AppearanceProblem:
     skin_prior: SkinPrior | None
     direct: torch.Tensor
     bounces: Bounces
+    whites: AppearanceProblem | None = None
     _latest_lobes: _Latest = field(default_factory=_Latest, repr=False)
     _latest_frame_light: _Latest = field(default_factory=_Latest, repr=False)
     _latest_lamp: _Latest = field(default_factory=_Latest, repr=False)
@@ -189,6 +192,9 @@ class AppearanceProblem:
         skin_prior = None
         if settings.skin is not None and capture.skin.any():
             skin_prior = SkinPrior(capture.points.positions, capture.skin, settings.skin)
+        whites = None
+        if capture.whites is not None:
+            whites = cls.of(capture.whites, replace(settings, specular=False, skin=None))
         return cls(
             capture=capture,
             settings=settings,
@@ -198,6 +204,7 @@ class AppearanceProblem:
             skin_prior=skin_prior,
             direct=torch.from_numpy(capture.transfer.direct.astype(np.float32)),
             bounces=Bounces.of(capture.transfer, capture.node_transfer),
+            whites=whites,
         )
 
     def take(self, index: slice | np.ndarray) -> AppearanceProblem:
@@ -254,12 +261,32 @@ class AppearanceProblem:
     # ------------------------------------------------------------------ operators
     def transport(self, state: AppearanceState) -> Transport:
         """How light reaches the points in a state."""
+        lobes = self.lobes_at(state.roughness) if self.settings.specular else None
+        return Transport(self.frame_light(state), self.direct, self.total_transfer(state), lobes,
+                         self.lamp_transfer(state))
+
+    def frame_light(self, state: AppearanceState) -> FrameLight:
+        """The far light along the directions in each frame, of a light of the state's resolution."""
         capture = self.capture
         near = None if capture.lamp is None else capture.lamp.lamp.texels(state.light_model.resolution)
-        frame_light = self._latest_frame_light(state.light_model.resolution, lambda resolution: FrameLight(
+        return self._latest_frame_light(state.light_model.resolution, lambda resolution: FrameLight(
             resolution, capture.directions, capture.world_from_head, capture.light_index, near))
-        lobes = self.lobes_at(state.roughness) if self.settings.specular else None
-        return Transport(frame_light, self.direct, self.total_transfer(state), lobes, self.lamp_transfer(state))
+
+    def irradiance(self, state: AppearanceState) -> np.ndarray:
+        """[3, P, F]: irradiance over pi under the state's light, as transport(state).forward has it, for once: the
+        light's own bounces are summed in place of those from each direction."""
+        capture, light = self.capture, state.light
+        along = np.ascontiguousarray(np.moveaxis(self.frame_light(state).along(light), -1, 0))
+        points, nodes = self.direct.numpy() @ along, self.bounces.to_nodes @ along
+        if capture.lamp is not None:
+            view, to_points, to_nodes = self._latest_lamp(state.light_model.resolution, self._lamp_rows)
+            own = light[view.texels].astype(np.float32).T
+            points += np.stack([to_points @ channel for channel in own])
+            nodes += np.stack([to_nodes @ channel for channel in own])
+        if not self.settings.bounce:
+            return points
+        radiosity = node_radiosity(capture.node_transfer, _sent_on(state), np.moveaxis(nodes, 0, -1))
+        return points + self.bounces.to_points @ np.moveaxis(radiosity, -1, 0)
 
     def total_transfer(self, state: AppearanceState) -> torch.Tensor:
         """[3, P, J]: irradiance from each direction, with all diffuse bounces between surfaces of the state's albedo.
@@ -321,6 +348,13 @@ class AppearanceProblem:
     def brightest_skin(self, albedo: torch.Tensor) -> np.ndarray:
         """[3]: log of the skin points' albedo [3, P, 1] at the quantile BRIGHTEST."""
         return np.log(np.quantile(albedo[:, torch.from_numpy(self.capture.skin), 0].numpy(), BRIGHTEST, axis=1))
+
+    def said_by_whites(self, state: AppearanceState) -> tuple[np.ndarray, np.ndarray] | None:
+        """The log factor [3] on the state's light that the whites of the eyes ask for, and its covariance [3, 3]; None
+        where the clip shows too little of them."""
+        if self.whites is None:
+            return None
+        return whites_statement(self.whites.capture.samples, self.whites.irradiance(state))
 
     def relative_light(self, irradiance: torch.Tensor) -> np.ndarray:
         """[L, 3]: log of the skin's mean irradiance [3, P, F] in the frames of each light, relative to that in all

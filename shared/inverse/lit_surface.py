@@ -14,6 +14,7 @@ from shared.compute.run_context import RunContext
 from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
+from shared.imaging.turning_eyes import TurningEyes
 from shared.imaging.views import Views
 from shared.inverse.problem import FACE_SKIN, InverseSettings
 from shared.rendering.direction_set import concentrated, split_directions
@@ -52,7 +53,8 @@ class LitSurface:
         viewer = SurfaceViewer.of(surface.mesh, layout)
         precomputed = precompute_transfer(viewer, settings.sizes, settings.appearance.visibility, directions)
         moves, skin = settings.appearance.light_moves(views.moves), surface.vertices_of(FACE_SKIN)
-        capture = build_capture(viewer, precomputed, views, moves, skin, settings.sizes.points, context)
+        eyes = None if views.gaze is None else TurningEyes.of(surface)
+        capture = build_capture(viewer, precomputed, views, moves, skin, settings.sizes.points, context, eyes)
         capture = replace(capture, chart=chart)
         found = cls(surface, viewer, precomputed, capture, capture.some_points(settings.appearance.coarse_points))
         return found if lamp is None else found.with_lamp(lamp, views, moves)
@@ -61,8 +63,8 @@ class LitSurface:
         """The same under a light whose lamp stands near; views: those that it was made of; moves: what moves against
         the light."""
         seen, whole = SeenLamp.of(lamp, views.camera_from_head, moves), self.coarse is self.capture
-        capture = replace(self.capture, lamp=seen)
-        return replace(self, capture=capture, coarse=capture if whole else replace(self.coarse, lamp=seen))
+        capture = self.capture.under_lamp(seen)
+        return replace(self, capture=capture, coarse=capture if whole else self.coarse.under_lamp(seen))
 
 
 def suited_directions(lit: LitSurface, solution: Solution) -> np.ndarray:

@@ -15,6 +15,7 @@ from shared.geometry.mesh import segments_at
 from shared.geometry.surface import Surface
 from shared.imaging.frame_index import hold_out, spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
+from shared.imaging.turning_eyes import TurningEyes
 from shared.imaging.views import Views
 from shared.inverse.problem import FACE_SKIN, InverseSettings, some_views
 from shared.rendering.precomputed_transfer import Sizes, precompute_transfer
@@ -73,13 +74,13 @@ class SmallClip:
         self.precomputed = Made(lambda visibility: precompute_transfer(viewer, self.sizes, visibility))
         moves, skin = settings.appearance.light_moves(views.moves), surface.vertices_of(FACE_SKIN)
         few = selection_views(views, settings)
-        seen = build_capture(viewer, self.precomputed[True], few, moves, skin, self.sizes.points, context)
+        eyes = None if few.gaze is None else TurningEyes.of(surface)
+        seen = build_capture(viewer, self.precomputed[True], few, moves, skin, self.sizes.points, context, eyes)
         self.captures = Made(self._without_visibility)
         self.captures[True] = replace(seen, chart=chart)
 
     def _without_visibility(self, visibility: bool) -> Capture:
-        seen, bare = self.captures[True], self.precomputed[visibility]
-        return replace(seen, transfer=bare.trace(seen.points), node_transfer=bare.node_transfer)
+        return self.captures[True].traced_anew(self.precomputed[visibility])
 
 
 def selection_views(views: Views, settings: InverseSettings) -> Views:

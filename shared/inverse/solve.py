@@ -9,6 +9,7 @@ import numpy as np
 
 from shared.appearance.chart_scale import describe_scale, scale_warnings, state_chart
 from shared.appearance.diagnostics import diagnostic_warnings, diagnostics_of, face_regions
+from shared.appearance.eye_whites import describe_whites
 from shared.appearance.fine_normals import NormalPass, resolved_texels
 from shared.appearance.fit import Solution, fit_all_points, fit_appearance
 from shared.appearance.light_models import SeveralLights
@@ -99,7 +100,7 @@ def solve_clip(
         solution = fit_all_points(lit.capture, settings.appearance, solution, report_to(context))
     if selected.variation is not None:
         solution = selected.variation.worn_by(solution)
-    diagnostics, solution = examine(lit, settings.appearance, solution)
+    diagnostics, solution, whites = examine(lit, settings.appearance, solution)
 
     # Under that light, of that shape: every texel's material, and relief finer than the mesh.
     surface, precomputed = lit.surface, lit.precomputed
@@ -137,7 +138,7 @@ def solve_clip(
         "diagnostics": diagnostics,
         "warnings": [*filter(None, [chart_warning]), *scale_warnings(chart, typical),
                      *diagnostic_warnings(diagnostics, views.moves)],
-        "albedo_scale": describe_scale(chart, typical),
+        "albedo_scale": describe_scale(chart, typical, whites),
         "model_selection": selected.candidates,
     }
     maps = make_maps(texels, material, roughness, turn, None if eye_texels is None else eye_texels.rows)
@@ -146,9 +147,9 @@ def solve_clip(
 
 def examine(
     lit: LitSurface, settings: AppearanceSettings, solution: Solution
-) -> tuple[dict[str, float], Solution]:
-    """What the samples show beside the light: diagnostics of what the model cannot follow, and the solution with
-    roughness that varies over the skin where that serves."""
+) -> tuple[dict[str, float], Solution, dict | None]:
+    """What the samples show beside the light: diagnostics of what the model cannot follow, the solution with roughness
+    that varies over the skin where that serves, and what the whites of the eyes say of the scale, None: nothing."""
     problem, surface = AppearanceProblem.of(lit.capture, settings), lit.surface
     positions = lit.capture.points.positions
     regions = face_regions(surface.mesh, surface.face_segment, surface.segment_names, positions)
@@ -156,7 +157,9 @@ def examine(
     if settings.specular and settings.local_roughness:
         fit, said = local_roughness(problem, solution.state)
         solution = replace(solution, local_roughness_fit=fit, roughness_record=said)
-    return diagnostics, solution
+    said_by_whites = problem.said_by_whites(solution.state)
+    whites = None if said_by_whites is None else describe_whites(len(lit.capture.whites.points), *said_by_whites)
+    return diagnostics, solution, whites
 
 
 def scalp_of(surface: Surface) -> np.ndarray | None:

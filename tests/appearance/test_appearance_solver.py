@@ -13,10 +13,12 @@ from toy_capture import (
     linearised,
     make_truth,
     started,
+    swinging,
     true_light,
     under_true_light,
 )
 
+from shared.appearance.eye_whites import USUAL_ALBEDO
 from shared.appearance.fit import FitState, step
 from shared.appearance.problem import AppearanceProblem, AppearanceSettings
 from shared.appearance.projection import (
@@ -26,8 +28,10 @@ from shared.appearance.projection import (
     measure_highlights,
     project_off_albedo,
 )
+from shared.geometry.transforms import places_in_world
 from shared.rendering.envmap import cube_directions
 from shared.rendering.lobes import SpecularTransfer, specular_reflection
+from shared.rendering.near_lamp import NearLamp, SeenLamp
 from shared.rendering.shading import light_along
 from shared.rendering.transfer import nearest_points
 
@@ -78,6 +82,29 @@ def test_forward_model_is_the_composition_of_its_modules(truth):
     expected = specular_reflection(table, capture.samples.towards_camera[:, 3], ROUGHNESS, along[:, 3])
     open_points = capture.transfer.blocked < 1e-3
     assert np.allclose(reflection[:, :, 3].numpy().T[open_points], expected[open_points], rtol=0.02, atol=1e-3)
+
+
+@pytest.mark.parametrize("distance", [None, 600.0], ids=["far", "near"])
+@pytest.mark.parametrize("bounce", [True, False])
+def test_irradiance_of_one_light_is_the_transports(truth, distance, bounce):
+    capture = truth[0]
+    if distance is not None:
+        lamp = NearLamp(distance, tuple(places_in_world(swinging(), "head").mean(0)), (-0.57, 0.48, 0.67), 0.3)
+        capture = capture.under_lamp(SeenLamp.of(lamp, swinging(), "head"))
+    problem, state, irradiance, _ = truly_lit(capture, replace(MATTE, bounce=bounce))
+    np.testing.assert_allclose(problem.irradiance(state), irradiance.numpy(), rtol=2e-4, atol=2e-5)
+
+
+def test_whites_are_lit_as_the_points_are_and_say_what_they_show(truth):
+    """Places on the skin that pass for whites of the usual albedo, once under half of the light's brightness."""
+    capture, _, light = truth
+    samples = replace(capture.samples, colours=(USUAL_ALBEDO * light).astype(np.float32))
+    whites = replace(capture, samples=samples)
+    problem, state, _, _ = truly_lit(replace(capture, whites=whites), MATTE)
+    np.testing.assert_allclose(problem.said_by_whites(state)[0], 0.0, atol=0.02)
+    dim = replace(state, params=state.params - np.log(2.0))
+    np.testing.assert_allclose(problem.said_by_whites(dim)[0], np.log(2.0), atol=0.02)
+    assert truly_lit(capture, MATTE)[0].said_by_whites(state) is None
 
 
 @pytest.mark.parametrize("settings", [MATTE, GLOSSY], ids=["matte", "glossy"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from shared.geometry.mesh import Mesh, midpoint_subdivision, normalised
+from shared.geometry.surface import Surface
 from shared.geometry.transforms import rigid, rotation_from_vector
 
 LENS = np.array([[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]])
@@ -34,6 +35,19 @@ def grid_plane(count: int = 9, extent: float = 1.0) -> Mesh:
     upper = np.stack([corner, corner + count + 1, corner + count], axis=1)
     faces = np.concatenate([lower, upper]).astype(np.int32)
     return Mesh(vertices, faces, uvs, faces)
+
+
+def two_balls(centres: np.ndarray, radius: float) -> Surface:
+    """A pair of eyeballs about centres [2, 3], right and left, each with a half of the map."""
+    ball = sphere(radius, 4)
+    faces, uvs = ball.faces, ball.uvs * [0.5, 1.0]
+    mesh = Mesh(
+        np.concatenate([ball.vertices + centre for centre in centres]),
+        np.concatenate([faces, faces + len(ball.vertices)]),
+        np.concatenate([uvs, uvs + [0.5, 0.0]]),
+        np.concatenate([ball.face_uvs, ball.face_uvs + len(uvs)]),
+    )
+    return Surface(mesh, np.zeros(2 * len(faces), np.uint8), ("eyes",))
 
 
 def turned(vectors, place=(0.0, 0.0, 900.0)):

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from shapes import FACING, sphere
+from shapes import FACING, two_balls
 
 from shared.geometry.eyeballs import gaze_rotation
-from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface
 from shared.geometry.transforms import camera_centres, rigid
 from shared.imaging.image_sampling import SurfaceViewer, prepare_picture
@@ -18,22 +17,6 @@ POSE = rigid(FACING, np.array([0.0, 0.0, 400.0]))
 CENTRES, RADIUS = np.array([[-25.0, 0.0, 0.0], [25.0, 0.0, 0.0]]), 15.0
 GAZES = np.random.default_rng(3).uniform(-0.45, 0.45, (12, 2, 2))
 MAP = 128
-
-
-def two_eyes():
-    """A mesh of two balls side by side, each with a half of the map."""
-    ball = sphere(RADIUS, 4)
-    faces, uvs = ball.faces, ball.uvs * [0.5, 1.0]
-    return Surface(
-        Mesh(
-            np.concatenate([ball.vertices + centre for centre in CENTRES]),
-            np.concatenate([faces, faces + len(ball.vertices)]),
-            np.concatenate([uvs, uvs + [0.5, 0.0]]),
-            np.concatenate([ball.face_uvs, ball.face_uvs + len(uvs)]),
-        ),
-        np.zeros(2 * len(faces), np.uint8),
-        ("eyes",),
-    )
 
 
 def paint(directions):
@@ -63,7 +46,7 @@ def picture_of(gaze):
 
 @pytest.fixture(scope="module")
 def eyes():
-    surface = two_eyes()
+    surface = two_balls(CENTRES, RADIUS)
     texels, viewer = TexelSurface(surface.mesh, MAP), SurfaceViewer.of(surface.mesh)
     turning = TurningEyes.of(surface)
     return texels, viewer, EyeTexels(texels, viewer, turning, np.zeros(len(surface.mesh.faces), bool))
@@ -183,5 +166,5 @@ def test_depth_in_a_polygon():
 
 
 def test_a_mesh_without_eyes_has_none_that_turn():
-    surface = two_eyes()
+    surface = two_balls(CENTRES, RADIUS)
     assert TurningEyes.of(Surface(surface.mesh, surface.face_segment, ("skin",))) is None
