@@ -11,6 +11,7 @@ Measures: geometry_mm    distance of the true face's points to the result's surf
                          albedo.confident: where maps/confidence.exr, if there is one, is above 0.5
          envmap          through a cosine and a 25 degree lobe, per-channel gain removed
          rerender, relight   sRGB-coded PSNR on the face skin, raw and with one gain per channel
+         lid_margins_mm  with them: between the borders of what lids leave open, as the camera sees them
          gaze, rerender_eyes where the truth has living eyes: degrees between directions, blinks found, and the PSNR on
                          eyes and lids, of which held_out are frames that the solver did not see
 Frames:  the result's head frame and scale may be any; it is aligned by a similarity transform (camera centres first,
@@ -30,12 +31,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shared.errors import InputError
+from shared.geometry.eyeballs import eyeballs_of
 from shared.geometry.mesh import Mesh
+from shared.geometry.surface import Surface
 from shared.imaging.color import decode_srgb
 from shared.io.arrays import load_arrays, read_json, write_json
 from shared.io.images import read_exr, read_png
-from shared.io.meshes import read_obj
-from tools.scoring import align, gaze, measures
+from shared.io.meshes import load_mesh, read_obj
+from tools.scoring import align, gaze, lid_margins, measures
 from tools.scoring.buffers import BufferRenderer
 from tools.scoring.table import table
 
@@ -193,7 +196,36 @@ def score_eyes(subject: Path, export: Path, truth: dict[str, np.ndarray], truth_
         scores["rerender_eyes"] = {"frames": len(pairs), **measures.image_errors(list(pairs.values()))}
     if held:
         scores["rerender_eyes"]["held_out"] = {"frames": len(held), **measures.image_errors(held)}
+    if (margins := score_lids(subject, export, truth)) is not None:
+        scores["lid_margins_mm"] = margins
     return scores
+
+
+def score_lids(subject: Path, export: Path, truth: dict[str, np.ndarray]) -> dict | None:
+    """How far the mesh's lids are from the truth's, see lid_margins, in frames with open eyes; None where the stages'
+    folders are not beside the export, or the head has no eyeballs."""
+    mesh_path = export.parent / "work" / "inverse_render" / "mesh.npz"
+    tracking_path = export.parent / "work" / "track_landmarks" / "tracking.json"
+    if not (mesh_path.exists() and tracking_path.exists()):
+        return None
+    segment, names = load_arrays(mesh_path).get("face_segment"), tuple(read_json(tracking_path)["segments"])
+    surface = Surface(load_mesh(mesh_path), segment, names)
+    if eyeballs_of(surface) is None:
+        return None
+    result, radius, pairs = load_result(export, camera_intrinsics(subject)), float(truth["eyeball_radius"]), []
+    for frame in truth["gt_frames"].tolist():
+        if frame not in result.poses or np.isnan(truth["gaze"][frame]).any():
+            continue
+        depth = read_exr(subject / "gt" / "frames" / f"{frame:04d}_depth.exr")
+        pose, lens = truth["camera_from_head"][frame], truth["K"]
+        near = gaze.eye_pixels(depth, pose, lens, truth["eyeball_centres"], radius)
+        found = lid_margins.opening_of_result(surface, near, result.poses[frame], result.intrinsics)
+        for centre in truth["eyeball_centres"]:
+            own = gaze.eye_pixels(depth, pose, lens, centre[None], radius)
+            seen = lid_margins.opening_of_truth(depth, pose, lens, centre, radius) & own
+            pixel_mm = (pose[:3, :3] @ centre + pose[:3, 3])[2] / lens[0, 0]
+            pairs.append((seen, found & own, pixel_mm))
+    return lid_margins.lid_margin_errors(pairs)
 
 
 def _normal_angles(truth: np.ndarray, found: np.ndarray) -> np.ndarray:

@@ -68,6 +68,9 @@ def _eye_lines(scores: dict) -> list[tuple[str, str]]:
         held = scores["rerender_eyes"].get("held_out")
         text = GAINS.format(**scores["rerender_eyes"]) + f", {scores['rerender_eyes']['frames']} frames"
         lines.append(("eyes", text + (f"; held out {GAINS.format(**held)}, {held['frames']} frames" if held else "")))
+    if "lid_margins_mm" in scores:
+        margins = scores["lid_margins_mm"]
+        lines.append(("lids", f"margins off by {_spread(margins)} mm, {margins['openings']} openings"))
     return lines
 
 
