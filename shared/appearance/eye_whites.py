@@ -44,7 +44,7 @@ the truth."""
 class WhitesSeen:
     """Collects what the frames of some views show of the whites: look(f, picture) for every frame, then samples().
 
-    places: points of both eyeballs.
+    places: points of both eyeballs, the right one's first.
     """
 
     def __init__(self, eyes: TurningEyes, scene: RayScene, views: Views):
@@ -52,12 +52,11 @@ class WhitesSeen:
         self._cameras = camera_centres(views.camera_from_head)
         directions = fibonacci_sphere(DIRECTIONS)
         directions = directions[directions[:, 2] > 0.0]
-        self._outward = np.concatenate([directions, directions])
         self._side = np.repeat([0, 1], len(directions))
         self._iris = np.array([np.arcsin((IRIS_MM + LIMBUS_MM) / ball.radius) for ball in eyes.balls])
         on_mesh = [eyes.place(side, directions) for side in (0, 1)]
         positions = [interpolate(eyes.mesh.vertices, eyes.mesh.faces, *place) for place in on_mesh]
-        self.places = Points(np.concatenate(positions), self._outward)
+        self.places = Points(np.concatenate(positions), np.concatenate([directions, directions]))
         shape = len(self.places), len(views)
         self._colours, self._weight = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
         self._towards = np.zeros((*shape, 3), np.float32)

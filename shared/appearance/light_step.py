@@ -285,8 +285,8 @@ class LinearisedFit:
             light = np.split(state.light, len(relative))[chart.light]
             chart = chart.log_factor(light, np.exp(log_albedo + log_irradiance + relative[chart.light]))
         log_factor, specular = resolve_scale(
-            log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart, relative,
-            problem.brightest_skin(albedo), problem.said_by_whites(state),
+            log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart=chart,
+            relative_light=relative, log_brightest=problem.brightest_skin(albedo), whites=problem.said_by_whites(state),
         )
         factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]
         irradiance, reflection = irradiance * factor, reflection * factor

@@ -78,7 +78,7 @@ class TexturePass:
     specular: the clip's one intensity or each texel's [T], the prior's mean; typical_albedo [3]; sigma: how far a texel
     may leave it;
     light_weights: how much samples of each light count, by how well the model follows it; empty: all alike;
-    region [V]: parts of the head, skin and hair, of which one says nothing of the other;
+    region [V] bool: the part of the head that hair may cover, of which skin says nothing, nor it of skin;
     bare [V] bool: bare skin, None: all; of brows, lips or clothes the skin around says nothing, however much frames
     contradict each other there;
     eyes: texels that turn with the views' gaze, and of which skin says nothing; None: none do.
@@ -277,11 +277,17 @@ class TexturePass:
 
     def _field(self, means: np.ndarray, precision: np.ndarray, fields: SmoothFields) -> np.ndarray:
         """Vertex values [V, C, K], means of texels of some precision [T, C] -> the smooth fields [V, C, K] through
-        them; 0 far from any."""
+        them; far from any 0, the typical skin, and in the other region what is known of that in the mean: hair is
+        continued as hair."""
         share, _ = self.surface.to_vertices(precision, np.ones_like(precision))
         # What leaves a texel as open as the prior does is mostly a model's error that its neighbours share.
         known = share**2 / (share + PRIOR_SPREAD**-2)
-        return fields.through(means, known, np.zeros(precision.shape[1]))
+        usual = np.zeros_like(means)
+        if self.region is not None:
+            own = known[self.region, :, None]
+            total = own.sum(0)
+            usual[self.region] = (own * means[self.region]).sum(0) / np.where(total > 0.0, total, 1.0)
+        return usual + fields.through(means - usual, known, np.zeros(precision.shape[1]))
 
     def held_out_errors(self, candidates: list[TexelMaterial]) -> list[float]:
         """Root mean square residual of each candidate on the held-out frames (linear, censored, weighted)."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from shapes import grid_plane, turned
 
+from shared.appearance import texture_pass
 from shared.appearance.maps import make_maps
 from shared.appearance.texture_pass import TexturePass
 from shared.geometry.mesh import interpolate
@@ -15,6 +16,7 @@ from shared.imaging.views import Views
 
 SIZE, LENS = (96, 96), np.array([[400.0, 0, 48], [0, 400.0, 48], [0, 0, 1]])
 FRAMES, SPECULAR, MAP = 10, 0.6, 48
+TYPICAL = np.array([0.5, 0.4, 0.25])
 
 
 class PlateShading:
@@ -89,12 +91,13 @@ def plate_views(mesh, shading, clip_at=np.inf):
     return Views.in_one_light(poses, LENS, SIZE, "head", pictures.__getitem__, None, fitted)
 
 
-def run_pass(clip_at=np.inf, specular=SPECULAR, widths=(np.inf,)):
+def run_pass(clip_at=np.inf, specular=SPECULAR, widths=(np.inf,), region_from=None):
     mesh = grid_plane(33, 80.0)
     shading = PlateShading(mesh)
     surface, viewer = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh)
     views = plate_views(mesh, shading, clip_at)
-    texture = TexturePass(surface, viewer, shading, views, specular, np.array([0.5, 0.4, 0.25]))
+    region = None if region_from is None else mesh.uvs[:, 0] > region_from
+    texture = TexturePass(surface, viewer, shading, views, specular, TYPICAL, region=region)
     material, record = texture.run(widths)
     return surface, material, record, make_maps(surface, material, 0.4)
 
@@ -133,6 +136,20 @@ def test_unseen_texels_are_filled_and_not_trusted(plate):
     assert np.abs(np.log(material.albedo[unseen] / np.array([0.4, 0.42, 0.28]))).max() < 0.7
 
 
+def test_what_no_frame_shows_is_hair_where_the_rest_of_it_is(monkeypatch):
+    """A fill that soon sinks to what is usual: typical skin, but in a region of its own that region's mean."""
+    monkeypatch.setattr(texture_pass, "SURROUNDINGS_SPREAD", 0.02)
+    found = {}
+    for region_from in (None, 0.6):
+        surface, material, *_ = run_pass(region_from=region_from)
+        uv = texel_uv(surface)
+        found[region_from] = np.median(material.albedo[uv[:, 0] > 0.97], axis=0)
+    known = (uv[:, 0] > 0.6) & (uv[:, 0] < 0.8)
+    own = np.exp(np.log(true_albedo(uv[known])).mean(0))
+    assert np.abs(np.log(found[None] / TYPICAL)).max() < 0.03
+    assert np.abs(np.log(found[0.6] / own)).max() < 0.08 < np.abs(np.log(own / TYPICAL)).max()
+
+
 def test_more_frames_mean_more_confidence():
     mesh = grid_plane(17, 80.0)
     shading, surface = PlateShading(mesh), TexelSurface(mesh, 24)
@@ -157,7 +174,7 @@ def test_what_frames_contradict_each_other_about_is_not_trusted():
             return super().irradiance(frame) * (1.0 + wrong)
 
     surface, viewer, views = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh), plate_views(mesh, PlateShading(mesh))
-    texture = TexturePass(surface, viewer, WrongPlate(mesh), views, SPECULAR, np.array([0.5, 0.4, 0.25]))
+    texture = TexturePass(surface, viewer, WrongPlate(mesh), views, SPECULAR, TYPICAL)
     material, _ = texture.run((np.inf,))
     confidence = make_maps(surface, material, 0.4)["confidence"].ravel()[surface.pixel]
     uv = texel_uv(surface)
@@ -178,7 +195,7 @@ def contradicted_plate(bare=None, wrong=0.6):
 
     surface, viewer, views = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh), plate_views(mesh, PlateShading(mesh))
     bare = None if bare is None else np.full(len(mesh.vertices), bare)
-    texture = TexturePass(surface, viewer, WrongPlate(mesh), views, SPECULAR, np.array([0.5, 0.4, 0.25]), bare=bare)
+    texture = TexturePass(surface, viewer, WrongPlate(mesh), views, SPECULAR, TYPICAL, bare=bare)
     material, record = texture.run((np.inf,))
     return material, record["contradicted"], texel_uv(surface)[:, 0] < 0.35
 
@@ -215,7 +232,7 @@ def test_borders_of_shadows_that_lie_elsewhere_spoil_little():
     surface, viewer, views = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh), plate_views(mesh, ShadedPlate(mesh))
     for uncertainty in (False, True):
         shading = ShadedPlate(mesh, 0.04, uncertainty)
-        material, _ = TexturePass(surface, viewer, shading, views, SPECULAR, np.array([0.5, 0.4, 0.25])).run((np.inf,))
+        material, _ = TexturePass(surface, viewer, shading, views, SPECULAR, TYPICAL).run((np.inf,))
         confidence = make_maps(surface, material, 0.4)["confidence"].ravel()[surface.pixel]
         found.append((np.abs(np.log(material.albedo / true_albedo(texel_uv(surface)))).max(1), confidence))
     (plain, sure), (uncertain, less_sure) = found
