@@ -70,6 +70,8 @@ def test_pixels_of_an_eye_are_an_ellipse_about_its_centre():
     assert seen.sum() == pytest.approx(area, rel=0.02)
     assert seen[60, 40] and seen[60, 160] and not seen[60, 100]
     assert not eye_pixels(np.zeros((120, 200)), pose, lens, centres, radius).any()
+    at_the_outline = np.full((120, 200), 0.6 * distance)
+    assert not eye_pixels(at_the_outline, pose, lens, centres, radius).any()
     behind = centres + [0.0, 0.0, 30.0]
     assert not eye_pixels(np.full((120, 200), distance), pose, lens, behind, radius).any()
 

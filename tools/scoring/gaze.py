@@ -16,6 +16,9 @@ from tools.scoring.measures import summary
 
 REGION = (1.1, 0.75)
 """Half width and half height of the region of an eye, lids and all, in radii of its eyeball."""
+DEEP = 2.0
+"""Before its centre, in radii: what is farther away is no surface, but a mean of the head's depth and nothing at its
+outline."""
 
 
 def found_gaze(export: Path) -> dict[int, np.ndarray]:
@@ -74,4 +77,5 @@ def eye_pixels(depth: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.n
     place = np.concatenate([rays, np.ones((*depth.shape, 1))], -1) * depth[..., None]
     arm = ((place - camera_from_head[:3, 3]) @ camera_from_head[:3, :3])[..., None, :] - centres
     off = (arm[..., :2] / (radius * np.array(REGION))) ** 2
-    return (depth > 0) & ((off.sum(-1) < 1.0) & (arm[..., 2] > 0)).any(-1)
+    before = (arm[..., 2] > 0) & (arm[..., 2] < DEEP * radius)
+    return (depth > 0) & ((off.sum(-1) < 1.0) & before).any(-1)
