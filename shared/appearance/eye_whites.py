@@ -55,7 +55,7 @@ class WhitesSeen:
         self._side = np.repeat([0, 1], len(directions))
         self._iris = np.array([np.arcsin((IRIS_MM + LIMBUS_MM) / ball.radius) for ball in eyes.balls])
         on_mesh = [eyes.place(side, directions) for side in (0, 1)]
-        positions = [interpolate(eyes.mesh.vertices, eyes.mesh.faces, *place) for place in on_mesh]
+        positions = [interpolate(eyes.mesh.vertices, eyes.mesh.faces, face, bary) for face, bary in on_mesh]
         self.places = Points(np.concatenate(positions), np.concatenate([directions, directions]))
         shape = len(self.places), len(views)
         self._colours, self._weight = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)

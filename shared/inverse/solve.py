@@ -157,8 +157,10 @@ def examine(
     if settings.specular and settings.local_roughness:
         fit, said = local_roughness(problem, solution.state)
         solution = replace(solution, local_roughness_fit=fit, roughness_record=said)
-    said_by_whites = problem.said_by_whites(solution.state)
-    whites = None if said_by_whites is None else describe_whites(len(lit.capture.whites.points), *said_by_whites)
+    whites = None
+    if (said := problem.said_by_whites(solution.state)) is not None:
+        log_factor, covariance = said
+        whites = describe_whites(len(lit.capture.whites.points), log_factor, covariance)
     return diagnostics, solution, whites
 
 

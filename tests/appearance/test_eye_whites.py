@@ -74,7 +74,7 @@ def seen_in(gazes: np.ndarray, half_height_mm: float, clipped: bool = False) -> 
     lids_px = opening(half_height_mm)
     whites = WhitesSeen(TurningEyes.of(surface), SurfaceViewer.of(surface.mesh).scene, views_of(gazes, lids_px))
     pictures = [picture_of(np.nan_to_num(gaze), lids_px, clipped) for gaze in gazes]
-    assert [picture for picture in whites.looked_at(pictures)] == pictures
+    assert list(whites.looked_at(pictures)) == pictures
     return whites
 
 

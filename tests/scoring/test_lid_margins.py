@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from shapes import FACING, two_balls
 
+from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import camera_centres, rigid
 from tools.scoring.lid_margins import (
     LEAST_PIXELS,
@@ -63,11 +64,13 @@ def test_openings_of_truth_and_result_are_where_the_eyeballs_are_seen():
         seen = opening_of_truth(depth, POSE, LENS, centre, RADIUS)
         assert seen.sum() == pytest.approx(np.pi * (HOLE_MM * 900 / (DEPTH_MM - SKIN_MM)) ** 2, rel=0.05)
         assert seen[50, int(100 + 900 * centre[0] / DEPTH_MM)]
-    found = opening_of_result(two_balls(CENTRES, RADIUS), np.ones((100, 200), bool), POSE, LENS)
+    surface = two_balls(CENTRES, RADIUS)
+    scene = RayScene(surface.mesh.vertices, surface.mesh.faces)
+    right = surface.mesh.vertices[surface.mesh.faces[:, 0], 0] < 0
+    found = opening_of_result(scene, surface.faces_of(("eyes",)), POSE, LENS, (200, 100))
     assert found.sum() == pytest.approx(2 * np.pi * (RADIUS * 900 / DEPTH_MM) ** 2, rel=0.03)
-    half = np.arange(200) < 100
-    only = opening_of_result(two_balls(CENTRES, RADIUS), np.tile(half, (100, 1)), POSE, LENS)
-    assert (only == found & half).all()
+    only = opening_of_result(scene, right, POSE, LENS, (200, 100))
+    assert (only == found & (np.arange(200) < 100)).all()
 
 
 def test_errors_are_in_millimetres_of_openings_that_show_a_border():

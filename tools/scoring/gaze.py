@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from shared.geometry.eyeballs import SIDES, gaze_direction, gaze_towards
+from shared.geometry.raycast import pixel_directions
 from shared.io.arrays import load_arrays
 from tools.scoring.measures import summary
 
@@ -68,14 +69,19 @@ def _apart_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.degrees(2.0 * np.arcsin(np.clip(0.5 * chord, 0.0, 1.0)))
 
 
+def seen_places(depth: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """[H, W, 3] mm in head space: what each pixel of depth [H, W] mm shows; camera_from_head [4, 4], intrinsics [3, 3].
+    """
+    height, width = depth.shape
+    place = pixel_directions(intrinsics, width, height) * depth[..., None]
+    return (place - camera_from_head[:3, 3]) @ camera_from_head[:3, :3]
+
+
 def eye_pixels(depth: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray, centres: np.ndarray,
                radius: float) -> np.ndarray:
     """[H, W] bool: pixels that show an eye with its lids; depth [H, W] mm of the true surface, 0 beside it;
     camera_from_head [4, 4], intrinsics [3, 3]; centres [2, 3] and radius of the eyeballs, mm."""
-    row, column = np.indices(depth.shape)
-    rays = (np.stack([column, row], -1) + 0.5 - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]]
-    place = np.concatenate([rays, np.ones((*depth.shape, 1))], -1) * depth[..., None]
-    arm = ((place - camera_from_head[:3, 3]) @ camera_from_head[:3, :3])[..., None, :] - centres
+    arm = seen_places(depth, camera_from_head, intrinsics)[..., None, :] - centres
     off = (arm[..., :2] / (radius * np.array(REGION))) ** 2
     before = (arm[..., 2] > 0) & (arm[..., 2] < DEEP * radius)
     return (depth > 0) & ((off.sum(-1) < 1.0) & before).any(-1)

@@ -12,9 +12,8 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-from shared.geometry.raycast import RayScene
-from shared.geometry.surface import Surface
-from shared.geometry.transforms import camera_centres
+from shared.geometry.raycast import RayScene, camera_hits
+from tools.scoring.gaze import seen_places
 from tools.scoring.measures import summary
 
 ON_BALL_MM = 0.3
@@ -28,22 +27,18 @@ def opening_of_truth(
 ) -> np.ndarray:
     """[H, W] bool: pixels that show an eyeball of centre [3] and radius, mm; depth [H, W] mm of the true surface, 0
     beside it; camera_from_head [4, 4], intrinsics [3, 3]."""
-    place = _rays(depth.shape, intrinsics) * depth[..., None]
-    arm = (place - camera_from_head[:3, 3]) @ camera_from_head[:3, :3] - centre
-    return (depth > 0) & (np.abs(np.linalg.norm(arm, axis=-1) - radius) < ON_BALL_MM)
+    away = np.linalg.norm(seen_places(depth, camera_from_head, intrinsics) - centre, axis=-1)
+    return (depth > 0) & (np.abs(away - radius) < ON_BALL_MM)
 
 
 def opening_of_result(
-    surface: Surface, near: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray
+    scene: RayScene, eyes: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
-    """[H, W] bool: which of the pixels near [H, W] bool show an eyeball of the surface; the rest as in
-    opening_of_truth."""
-    directions = _rays(near.shape, intrinsics)[near] @ camera_from_head[:3, :3]
-    origins = np.broadcast_to(camera_centres(camera_from_head[None])[0], directions.shape)
-    face, _, _ = RayScene(surface.mesh.vertices, surface.mesh.faces).intersect(origins, directions)
-    found = np.zeros(near.shape, bool)
-    found[near] = (face >= 0) & surface.faces_of(("eyes",))[face]
-    return found
+    """[H, W] bool: which pixels of a picture of size (width, height) show an eyeball of a mesh; eyes [F] bool: its
+    faces; the rest as in opening_of_truth."""
+    width, height = size
+    face, _, _ = camera_hits(scene, camera_from_head, intrinsics, width, height)
+    return (face >= 0) & eyes[face]
 
 
 def border_distances(truth: np.ndarray, found: np.ndarray) -> np.ndarray:
@@ -58,13 +53,6 @@ def lid_margin_errors(pairs: Iterable[tuple[np.ndarray, np.ndarray, float]]) -> 
     apart = [border_distances(truth, found) * pixel_mm for truth, found, pixel_mm in pairs
              if min(truth.sum(), found.sum()) >= LEAST_PIXELS]
     return {"openings": len(apart), **summary(np.concatenate(apart))} if apart else None
-
-
-def _rays(shape: tuple[int, int], intrinsics: np.ndarray) -> np.ndarray:
-    """[H, W, 3]: directions through the pixels' centres, 1 along the camera's axis."""
-    row, column = np.indices(shape)
-    across = (np.stack([column, row], -1) + 0.5 - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]]
-    return np.concatenate([across, np.ones((*shape, 1))], -1)
 
 
 def _signed_distance(inside: np.ndarray) -> np.ndarray:

@@ -11,9 +11,9 @@ Measures: geometry_mm    distance of the true face's points to the result's surf
                          albedo.confident: where maps/confidence.exr, if there is one, is above 0.5
          envmap          through a cosine and a 25 degree lobe, per-channel gain removed
          rerender, relight   sRGB-coded PSNR on the face skin, raw and with one gain per channel
-         lid_margins_mm  with them: between the borders of what lids leave open, as the camera sees them
          gaze, rerender_eyes where the truth has living eyes: degrees between directions, blinks found, and the PSNR on
                          eyes and lids, of which held_out are frames that the solver did not see
+         lid_margins_mm  with them: between the borders of what lids leave open, as the camera sees them
 Frames:  the result's head frame and scale may be any; it is aligned by a similarity transform (camera centres first,
          then trimmed ICP on the face).
 """
@@ -33,6 +33,7 @@ from scipy.spatial import cKDTree
 from shared.errors import InputError
 from shared.geometry.eyeballs import eyeballs_of
 from shared.geometry.mesh import Mesh
+from shared.geometry.raycast import RayScene
 from shared.geometry.surface import Surface
 from shared.imaging.color import decode_srgb
 from shared.io.arrays import load_arrays, read_json, write_json
@@ -212,14 +213,14 @@ def score_lids(subject: Path, export: Path, truth: dict[str, np.ndarray]) -> dic
     surface = Surface(load_mesh(mesh_path), segment, names)
     if eyeballs_of(surface) is None:
         return None
+    scene, eyes = RayScene(surface.mesh.vertices, surface.mesh.faces), surface.faces_of(("eyes",))
     result, radius, pairs = load_result(export, camera_intrinsics(subject)), float(truth["eyeball_radius"]), []
     for frame in truth["gt_frames"].tolist():
         if frame not in result.poses or np.isnan(truth["gaze"][frame]).any():
             continue
         depth = read_exr(subject / "gt" / "frames" / f"{frame:04d}_depth.exr")
         pose, lens = truth["camera_from_head"][frame], truth["K"]
-        near = gaze.eye_pixels(depth, pose, lens, truth["eyeball_centres"], radius)
-        found = lid_margins.opening_of_result(surface, near, result.poses[frame], result.intrinsics)
+        found = lid_margins.opening_of_result(scene, eyes, result.poses[frame], result.intrinsics, depth.shape[::-1])
         for centre in truth["eyeball_centres"]:
             own = gaze.eye_pixels(depth, pose, lens, centre[None], radius)
             seen = lid_margins.opening_of_truth(depth, pose, lens, centre, radius) & own
