@@ -51,6 +51,9 @@ of a texel of whose samples that share is not clipped."""
 
 LEAST_BORDER_MM = 0.5
 """Error of where the head's outline lies, however well its surface is known."""
+BEHIND_OVER_SKIN = 0.5
+"""Typical difference in log radiance between what lies behind the head and the skin before it, by whose square texels
+near the border are drawn to their surroundings. How far they may be believed counts 1, for any background."""
 
 ERROR_OVER_SCATTER = 5.0
 """Variance of a texel's log albedo over the relative variance of what single frames say of it: what is wrong in some
@@ -163,7 +166,8 @@ class NormalEquations:
         the highlights of skin has an albedo that they leave open, but not that of the skin around it."""
         told = (self.ee > 1e-6) & (self._spared() > LEAST_UNCLIPPED)
         matt = self.ei / np.maximum(self.ee, 1e-6)
-        return np.where(told, matt * np.exp(DEVIATIONS_ABOVE * np.sqrt(variance)), np.inf)
+        above = np.minimum(DEVIATIONS_ABOVE * np.sqrt(variance), 10.0)  # e^10 bounds nothing, and overflows nothing
+        return np.where(told, matt * np.exp(above), np.inf)
 
     def specular_equations(self) -> tuple[np.ndarray, np.ndarray]:
         """Curvature and moment [T] of each texel's intensity with its albedo projected out, summed over channels."""
@@ -216,38 +220,47 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the frames of all lights say: equations, information [T, 3] on the log albedo, and, for each way to draw
-    texels to their surroundings, the variance [T, 3] by which it does, however many frames there are."""
+    """What the frames of all lights say: equations, information [T, 3] on the log albedo, and variances of it [T, 3]
+    that frames share, however many there are: one for each way to draw texels to their surroundings, and that of the
+    modelled irradiance."""
 
     equations: NormalEquations
     information: np.ndarray
     drawing: tuple[np.ndarray, ...]
+    irradiance: np.ndarray
 
 
 def weigh_lights(
     parts: Sequence[NormalEquations],
     systematic: Sequence[np.ndarray],
     typical_albedo: np.ndarray,
+    irradiance: Sequence[np.ndarray] | None = None,
     drawing: Sequence[Sequence[np.ndarray]] | None = None,
 ) -> Evidence:
-    """The equations of each light with the variance [T, 3] that its frames share -> of all lights together. drawing:
-    for each light and each way, the variance [T, 3] that draws texels to their surroundings; None: one way, all of it.
+    """The equations of each light with the variance [T, 3] that its frames share -> of all lights together.
+
+    For each light: irradiance: the part of that variance [T, 3] which is the modelled irradiance's; drawing: for each
+    way, the variance [T, 3] that draws texels to their surroundings. None: all of it, in one way.
 
     Where one light grazes or hardly reaches a texel another one decides: two lights' errors have nothing in common.
     """
+    irradiance = systematic if irradiance is None else irradiance
     drawing = [(error,) for error in systematic] if drawing is None else drawing
+    variances = [(*ways, error) for ways, error in zip(drawing, irradiance, strict=True)]
     information = sum(own.information(typical_albedo, error) for own, error in zip(parts, systematic, strict=True))
     if len(parts) == 1:
-        return Evidence(parts[0], information, tuple(drawing[0]))
+        *ways, lit = variances[0]
+        return Evidence(parts[0], information, tuple(ways), lit)
     whole = NormalEquations(len(information), parts[0].noise)
-    left = [np.zeros_like(information) for _ in drawing[0]]
-    for own, error, ways in zip(parts, systematic, drawing, strict=True):
+    left = [np.zeros_like(information) for _ in variances[0]]
+    for own, error, shared in zip(parts, systematic, variances, strict=True):
         share = own.independent_share(typical_albedo, error)
         whole.sums += own.sums * np.tile(share, PRODUCTS)
         whole.clipped_ee += own.clipped_ee * share
-        for sums, draws in zip(left, ways, strict=True):
-            sums += np.square(own.ee * share) * draws
-    return Evidence(whole, information, tuple(sums / np.maximum(np.square(whole.ee), 1e-12) for sums in left))
+        for sums, variance in zip(left, shared, strict=True):
+            sums += np.square(own.ee * share) * variance
+    *ways, lit = (sums / np.maximum(np.square(whole.ee), 1e-12) for sums in left)
+    return Evidence(whole, information, tuple(ways), lit)
 
 
 class BorderSums:

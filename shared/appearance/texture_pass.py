@@ -11,6 +11,7 @@ import numpy as np
 
 from shared.appearance.eye_albedo import round_albedo
 from shared.appearance.texture import (
+    BEHIND_OVER_SKIN,
     ERROR_OVER_SCATTER,
     IRRADIANCE_ERROR,
     LEAST_ALBEDO,
@@ -105,7 +106,8 @@ class TexturePass:
         lights = views.frames_of_lights
         self.light_weights = tuple(light_weights) or (1.0,) * len(lights)
         self.systematic = [
-            self._systematic(own) / weight for own, weight in zip(lights, self.light_weights, strict=True)
+            tuple(error / weight for error in self._systematic(own))
+            for own, weight in zip(lights, self.light_weights, strict=True)
         ]
         self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), context.progress
         if eyes is not None:
@@ -113,12 +115,13 @@ class TexturePass:
         self.region = region
         self.bare = 1.0 if bare is None else surface.interpolate(bare[:, None].astype(np.float32))
 
-    def _systematic(self, frames: np.ndarray) -> np.ndarray:
-        """[T, 3]: variance of the log albedo that all frames of one light share."""
+    def _systematic(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[T, 3] twice: variance of the log albedo that all frames of one light share, by the irradiance and by the
+        normal."""
         surface, shading = self.surface, self.shading
         mean = np.maximum(surface.interpolate(shading.mean_irradiance(frames)), 1e-6)
         turned = NORMAL_ERROR * surface.interpolate(shading.mean_slope(frames)) / mean
-        return np.square(IRRADIANCE_ERROR * np.median(mean, axis=0) / mean) + np.square(turned)
+        return np.square(IRRADIANCE_ERROR * np.median(mean, axis=0) / mean), np.square(turned)
 
     def run(self, widths: tuple[float, ...]) -> tuple[TexelMaterial, dict]:
         """Both passes -> the material, and a record of what the held-out frames said to each pooling width."""
@@ -159,13 +162,17 @@ class TexturePass:
             self._share_out(view, partial(self._add, material, part, border, scatter))
         for part, weight in zip(parts, self.light_weights, strict=True):
             part.scale(weight)
-        systematic, drawing = [], []
-        for error, border, part, scatter in zip(self.systematic, borders, parts, scatters, strict=True):
-            lit = error + border.variance()[:, None] + part.shadow_variance(self.typical_albedo)
-            steady, scattered = lit + part.highlight_variance(self.specular), scatter.variance()
-            systematic.append(steady + ERROR_OVER_SCATTER * scattered)
-            drawing.append((steady + PULL_OVER_SCATTER * self.bare * scattered, lit))
-        return weigh_lights(parts, systematic, self.typical_albedo, drawing)
+        systematic, irradiance, drawing = [], [], []
+        for (level, turned), border, part, scatter in zip(self.systematic, borders, parts, scatters, strict=True):
+            behind, shadow = border.variance()[:, None], part.shadow_variance(self.typical_albedo)
+            highlight, scattered = part.highlight_variance(self.specular), scatter.variance()
+            lit, pull = level + turned + behind + shadow, PULL_OVER_SCATTER * self.bare * scattered
+            systematic.append(lit + highlight + ERROR_OVER_SCATTER * scattered)
+            irradiance.append(lit + pull)
+            # The level is wrong alike all over a cavity: the skin around knows its albedo no better.
+            mean = turned + BEHIND_OVER_SKIN**2 * behind + shadow
+            drawing.append((mean + highlight + pull, mean))
+        return weigh_lights(parts, systematic, self.typical_albedo, irradiance, drawing)
 
     def view(self, f: int) -> FrameView:
         """One frame with the values that LitSamples takes."""
@@ -222,8 +229,7 @@ class TexturePass:
         equations, information = evidence.equations, evidence.information
         rough = [equations.solve_albedo(specular, 0.0, 1e-6) for specular in intensities]
         around = self._surroundings(rough, information, fields).astype(np.float32)
-        dim = np.maximum(evidence.drawing[0] - equations.highlight_variance(self.specular), 0.0)
-        brightest, found = np.maximum(equations.brightest_albedo(dim), LEAST_ALBEDO), []
+        brightest, found = np.maximum(equations.brightest_albedo(evidence.irradiance), LEAST_ALBEDO), []
         for drawing in evidence.drawing:
             pull = _ALBEDO_PULL + equations.ee * (drawing / PRIOR_SPREAD**2)
             own = equations.ee / (equations.ee + pull)
