@@ -226,34 +226,31 @@ def test_held_out_frames_choose_what_contradicted_skin_looks_like():
     assert record["held_out"]["as their mean"] == pytest.approx(record["held_out"]["as the skin around"], rel=5e-3)
 
 
-def test_borders_of_shadows_that_lie_elsewhere_spoil_little():
-    """Samples near a border that may lie elsewhere count less, and texels that have no others are trusted less."""
-    mesh, found = grid_plane(33, 80.0), []
-    surface, viewer, views = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh), plate_views(mesh, ShadedPlate(mesh))
-    for uncertainty in (False, True):
-        shading = ShadedPlate(mesh, 0.04, uncertainty)
-        material, _ = TexturePass(surface, viewer, shading, views, SPECULAR, TYPICAL).run((np.inf,))
-        confidence = make_maps(surface, material, 0.4)["confidence"].ravel()[surface.pixel]
-        found.append((np.abs(np.log(material.albedo / true_albedo(texel_uv(surface)))).max(1), confidence))
-    (plain, sure), (uncertain, less_sure) = found
-    u = texel_uv(surface)[:, 0]
-    crossed, never = (u > 0.12) & (u < 0.4), (u > 0.5) & (u < 0.7)
-    assert np.mean(uncertain[crossed] ** 2) < min(0.0465, 0.83 * np.mean(plain[crossed] ** 2))
-    trusted = [np.sqrt(np.mean(error[crossed & (conf > 0.5)] ** 2)) for error, conf in found]
-    assert max(trusted) < 0.04, "what is still trusted is right, by the frames' own contradictions too"
-    for with_uncertainty, without in ((uncertain, plain), (less_sure, sure)):
-        assert np.allclose(with_uncertainty[never], without[never], atol=0.01)
-
-
-def log_errors(shading, error_mm=0.0):
-    """[T] error of the log albedo, worst channel, confidence [T] and uv [T, 2] of a plate under its true shading;
-    error_mm: of its surface."""
+def log_errors(shading, filmed=None, error_mm=0.0):
+    """[T] error of the log albedo, worst channel, confidence [T] and uv [T, 2] of a plate; filmed: the true shading,
+    None: the solved one; error_mm: of its surface."""
     mesh = grid_plane(33, 80.0)
     surface, viewer = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh).within_rim(error_mm)
-    material, _ = TexturePass(surface, viewer, shading, plate_views(mesh, shading), SPECULAR, TYPICAL).run((np.inf,))
+    views = plate_views(mesh, shading if filmed is None else filmed)
+    material, _ = TexturePass(surface, viewer, shading, views, SPECULAR, TYPICAL).run((np.inf,))
     uv = texel_uv(surface)
     confidence = make_maps(surface, material, 0.4)["confidence"].ravel()[surface.pixel]
     return np.abs(np.log(material.albedo / true_albedo(uv))).max(1), confidence, uv
+
+
+def test_borders_of_shadows_that_lie_elsewhere_spoil_little():
+    """Samples near a border that may lie elsewhere count less, and texels that have no others are trusted less."""
+    mesh = grid_plane(33, 80.0)
+    plain, sure, uv = log_errors(ShadedPlate(mesh, 0.04), ShadedPlate(mesh))
+    uncertain, less_sure, _ = log_errors(ShadedPlate(mesh, 0.04, uncertainty=True), ShadedPlate(mesh))
+    u = uv[:, 0]
+    crossed, never = (u > 0.12) & (u < 0.4), (u > 0.5) & (u < 0.7)
+    assert np.mean(uncertain[crossed] ** 2) < min(0.0465, 0.83 * np.mean(plain[crossed] ** 2))
+    trusted = [np.sqrt(np.mean(error[crossed & (conf > 0.5)] ** 2))
+               for error, conf in ((plain, sure), (uncertain, less_sure))]  # fmt: skip
+    assert max(trusted) < 0.04, "what is still trusted is right, by the frames' own contradictions too"
+    for with_uncertainty, without in ((uncertain, plain), (less_sure, sure)):
+        assert np.allclose(with_uncertainty[never], without[never], atol=0.01)
 
 
 def test_texels_in_a_cavity_keep_their_own_albedo():
