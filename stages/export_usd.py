@@ -70,8 +70,6 @@ STAGE = Stage(
     ),
 )
 
-SMALLEST_HEAD_MM, LARGEST_HEAD_MM = 100.0, 800.0
-
 
 def read_maps(folder: Path) -> dict:
     """{name: array} of inverse_render's maps and of what follows from them; confidence clipped to [0, 1]."""
@@ -346,30 +344,14 @@ def run(job: Job) -> None:
 
 def check(job: Job) -> None:
     """Reads the files back as a stranger would; LimnError says all that is wrong."""
-    import numpy as np
+    from shared.io.export_checks import check_export
 
-    from shared.geometry.mesh_checks import mesh_errors
-    from shared.io.arrays import load_arrays
-    from shared.io.export_maps import MAPS, map_errors, map_file
-    from shared.io.images import read_exr
-    from shared.io.meshes import read_obj
-    from shared.io.usd_validate import package_errors, usd_errors
-
-    mesh = read_obj(job.out / "mesh.obj")
-    errors = [f"mesh.obj: {error}" for error in mesh_errors(mesh)]
-    size = float(np.ptp(mesh.vertices, axis=0).max())
-    if not SMALLEST_HEAD_MM < size < LARGEST_HEAD_MM:
-        errors.append(f"mesh.obj: {size:.0f} mm is not the size of a head")
-    for name in MAPS:
-        errors += map_errors(name, read_exr(job.out / "maps" / map_file(name, job.params.udim)))
-    rotations = load_arrays(job.out / "poses.npz")["camera_from_head"][:, :3, :3]
-    if not np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-6):
-        errors.append("poses.npz: not all poses are rigid")
-    errors += usd_errors(job.out / "head.usda")
-    if job.params.usdz:
-        errors += usd_errors(job.out / "head.usdz") + package_errors(job.out / "head.usdz")
-    if errors:
+    expected = [f"head.{kind}" for kind, wanted in (("usdz", job.params.usdz), ("glb", job.params.glb)) if wanted]
+    found = check_export(job.out, expected=expected)
+    if errors := [str(fault) for fault in found.faults if fault.fatal]:
         raise LimnError("the result does not pass its checks: " + "; ".join(errors))
+    for fault in found.faults:
+        job.note(f"{fault}; {fault.mend}")
 
 
 if __name__ == "__main__":

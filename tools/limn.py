@@ -8,7 +8,7 @@
     limn report SUBJECT...    where the report is
     limn overview SUBJECT...  one page over all of them
     limn clean SUBJECT...     remove intermediate results, keep export/
-    limn check EXPORT...      whether results are as they were published
+    limn check EXPORT...      whether results are whole and as other programs want them
     limn parameters           every stage's parameters
 
 Exit code 0: all well. 1: a stage failed. 2: the input is at fault; then each line on stderr is one fault. 3: finished,
@@ -94,10 +94,12 @@ def make_parser() -> argparse.ArgumentParser:
                           help="where to write it (overview.html)")
     removal.add_argument("--dry-run", action="store_true", help="only say what would go")
     _add_new(commands)
-    check = commands.add_parser("check", help="whether results are as they were published",
-                                description="compares every file with the SHA256SUMS of its export folder")
+    check = commands.add_parser("check", help="whether results are whole and as other programs want them",
+                                description="compares every file with the SHA256SUMS of its export folder, then looks "
+                                "into the files: USD, MaterialX, glTF, EXR, maps, mesh and poses")
     check.add_argument("folders", nargs="+", type=Path, metavar="EXPORT",
                        help="an export folder, wherever it lies, or a folder that holds one or several")
+    check.add_argument("--hashes", action="store_true", help="compare the files only, do not look into them")
     check.set_defaults(command=check_command)
     table = commands.add_parser("parameters", help="every stage's parameters as a table")
     table.add_argument("stages", nargs="*", metavar="STAGE")
@@ -262,7 +264,7 @@ def new_command(args: argparse.Namespace) -> int:
 
 def check_command(args: argparse.Namespace) -> int:
     """limn check"""
-    for line in check_exports(args.folders):
+    for line in check_exports(args.folders, args.hashes):
         print(line, flush=True)
     return 0
 

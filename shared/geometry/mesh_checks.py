@@ -79,7 +79,7 @@ def uv_overlap(mesh: Mesh, size: int) -> tuple[float, tuple[float, float]]:
     if len(rows) == 0:
         return 0.0, (0.0, 0.0)
     middle = (float(np.median(columns)) + 0.5) / size, 1.0 - (float(np.median(rows)) + 0.5) / size
-    return len(rows) / np.count_nonzero(cover), middle
+    return float(len(rows) / np.count_nonzero(cover)), middle
 
 
 def texel_cover(mesh: Mesh, size: int) -> np.ndarray:

@@ -23,6 +23,7 @@ MAPS = {
 }
 SOLVED_MAPS = tuple(name for name in MAPS if name != "specular_ior")
 """Those that inverse_render makes; specular_ior follows from specular_intensity."""
+_UP_TO_ONE = ("diffuse_albedo", "confidence", "normal", "roughness")
 UDIM_TILE = 1001
 WORKING_SPACE, ACESCG = "lin_rec709_scene", "lin_ap1_scene"
 
@@ -132,9 +133,12 @@ def map_errors(name: str, values: np.ndarray) -> list[str]:
     height, width = values.shape[:2]
     errors = []
     if height != width or width & (width - 1):
-        errors.append(f"{name}: {width} x {height} is not a square power of two")
-    if values.min() < -1e-3:
-        errors.append(f"{name}: negative values down to {values.min():.4g}")
-    if name in ("confidence", "normal", "roughness") and values.max() > 1.0 + 1e-3:
-        errors.append(f"{name}: values up to {values.max():.4g}, expected at most 1")
+        errors.append(f"{width} x {height} is not a square power of two")
+    if not np.isfinite(values).all():
+        return [*errors, f"{np.count_nonzero(~np.isfinite(values))} values are not finite"]
+    lowest = 1.0 if name == "specular_ior" else 0.0
+    if values.min() < lowest - 1e-3:
+        errors.append(f"values down to {values.min():.4g}, expected at least {lowest:.0f}")
+    if name in _UP_TO_ONE and values.max() > 1.0 + 1e-3:
+        errors.append(f"values up to {values.max():.4g}, expected at most 1")
     return errors

@@ -17,8 +17,9 @@ from shared.io.exr_header import check_decodable, read_parts
 
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _ACESCG = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
-_CHROMATICITIES = {"lin_rec709_scene": _REC709, "lin_ap1_scene": _ACESCG}
-COLOUR_SPACES = (*_CHROMATICITIES, "data")
+CHROMATICITIES = {"lin_rec709_scene": _REC709, "lin_ap1_scene": _ACESCG}
+"""Colour space -> the primaries and the white (x, y each) that are written with it."""
+COLOUR_SPACES = (*CHROMATICITIES, "data")
 HALF_MAXIMUM = 65504.0
 LAYOUTS = ("scanline", "tiled", "mipmap")
 TILE = 64
@@ -109,8 +110,8 @@ def _header(colour_space: str, attributes: dict, latlong: bool) -> dict:
         raise LimnError(f"unknown colour space {colour_space!r}; known: {', '.join(COLOUR_SPACES)}")
     header: dict = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
     header["colorInteropID"] = colour_space
-    if colour_space in _CHROMATICITIES:
-        header["chromaticities"] = _CHROMATICITIES[colour_space]
+    if colour_space in CHROMATICITIES:
+        header["chromaticities"] = CHROMATICITIES[colour_space]
     if latlong:
         header["envmap"] = OpenEXR.ENVMAP_LATLONG
     header.update({f"limn:{name}": value for name, value in attributes.items()})

@@ -557,7 +557,7 @@ def test_check_refuses_what_no_one_could_use(exported, work, tmp_path):
     job = ToyJob(work["head"], tmp_path / "export")
     export_usd.run(job)
     write_exr(job.out / "maps" / "roughness.exr", np.full((12, 12), 1.5), colour_space="data")
-    with pytest.raises(LimnError, match="roughness: 12 x 12 is not a square power of two.*values up to 1.5"):
+    with pytest.raises(LimnError, match="roughness.exr: 12 x 12 is not a square power of two.*values up to 1.5"):
         export_usd.check(job)
     assert MAP_SIZE & (MAP_SIZE - 1) == 0
 
