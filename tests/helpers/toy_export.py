@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from toy_result import ToyJob, toy_eyed_surface, write_toy_work
 
 from shared.contract.sums import write_sums
 from shared.geometry.surface import Surface
-from shared.io.arrays import write_json
+from shared.io.arrays import read_json, write_json
 from shared.io.meshes import save_mesh
 from stages import export_usd
 
@@ -22,12 +23,20 @@ def unfolded(surface: Surface) -> Surface:
     return Surface(mesh, surface.face_segment[kept], surface.segment_names)
 
 
-def write_toy_export(base: Path, **parameters) -> Path:
-    """Exports the head with two eyes into base/export -> that folder, with manifest.json and SHA256SUMS."""
+LAMP = {"near": True, "position_mm": [-500.0, 160.0, 300.0], "radius_mm": 35.0, "radiance": [8.0, 4.0, 2.0]}
+
+
+def write_toy_export(base: Path, lamp: bool = False, **parameters) -> Path:
+    """Exports the head with two eyes into base/export -> that folder, with manifest.json and SHA256SUMS. lamp: one
+    stands near."""
     work = write_toy_work(base / "work", eyes=True)
     surface = unfolded(toy_eyed_surface())
     arrays = {"face_segment": surface.face_segment}
     save_mesh(work / "inverse_render" / "mesh.npz", surface.mesh, **arrays)
+    if lamp:
+        solved = work / "inverse_render"
+        write_json(solved / "solve.json", read_json(solved / "solve.json") | {"lamp": LAMP})
+        shutil.copy(solved / "envmap.exr", solved / "envmap_far.exr")
     job = ToyJob(work, base / "export", **parameters)
     export_usd.run(job)
     export_usd.check(job)
