@@ -9,6 +9,7 @@
     limn overview SUBJECT...  one page over all of them
     limn clean SUBJECT...     remove intermediate results, keep export/
     limn check EXPORT...      whether results are whole and as other programs want them
+    limn turntable EXPORT...  videos of the head and of a light turning, a sheet of the maps
     limn parameters           every stage's parameters
 
 Exit code 0: all well. 1: a stage failed. 2: the input is at fault; then each line on stderr is one fault. 3: finished,
@@ -32,7 +33,7 @@ from shared.contract.subject import MOVES, TRANSFERS
 from shared.contract.wording import unknown_name
 from shared.errors import InputError, LimnError
 from tools.cli.cases import InputErrors, all_parameters, find_subjects, open_cases
-from tools.cli.check_export import check_exports
+from tools.cli.check_export import check_exports, find_exports
 from tools.cli.housekeeping import clean, report_path
 from tools.cli.plan import plan_case, plan_lines
 
@@ -101,6 +102,7 @@ def make_parser() -> argparse.ArgumentParser:
                        help="an export folder, wherever it lies, or a folder that holds one or several")
     check.add_argument("--hashes", action="store_true", help="compare the files only, do not look into them")
     check.set_defaults(command=check_command)
+    _add_turntable(commands)
     table = commands.add_parser("parameters", help="every stage's parameters as a table")
     table.add_argument("stages", nargs="*", metavar="STAGE")
     table.add_argument("--group", metavar="NAME", help="those of a group, which count in one case only")
@@ -139,6 +141,17 @@ def _add_new(commands: argparse._SubParsersAction) -> None:
     new.add_argument("--transfer", choices=TRANSFERS, default="srgb", help="how the file encodes light (srgb)")
     new.add_argument("--moves", choices=MOVES, default="head", help="what moves (head)")
     new.set_defaults(command=new_command)
+
+
+def _add_turntable(commands: argparse._SubParsersAction) -> None:
+    text = "videos of the head turning under three lights and of a light turning, and a sheet of the maps"
+    turntable = commands.add_parser("turntable", help=text, description=f"{text}; in turntable/ beside export/")
+    turntable.add_argument("folders", nargs="+", type=Path, metavar="EXPORT",
+                           help="an export folder, wherever it lies, or a folder that holds one or several")
+    turntable.add_argument("--size", type=int, default=480, metavar="PX", help="edge of one picture (480)")
+    turntable.add_argument("--frames", type=int, default=72, metavar="N", help="of a whole turn (72)")
+    turntable.add_argument("--fps", type=int, default=24, metavar="N", help="frames per second (24)")
+    turntable.set_defaults(command=turntable_command)
 
 
 def validate_command(args: argparse.Namespace) -> int:
@@ -266,6 +279,27 @@ def check_command(args: argparse.Namespace) -> int:
     """limn check"""
     for line in check_exports(args.folders, args.hashes):
         print(line, flush=True)
+    return 0
+
+
+def turntable_command(args: argparse.Namespace) -> int:
+    """limn turntable"""
+    from shared.contract.progress import terminal_bar
+    from tools.relight.turntable import TurntableSettings, write_turntable
+
+    def progress(items, label: str, total: int | None):
+        return terminal_bar(items, label, total) if sys.stderr.isatty() else items
+
+    errors: list[InputError] = []
+    for folder in args.folders:
+        try:
+            for export in find_exports(folder):
+                for line in write_turntable(export, TurntableSettings(args.size, args.frames, args.fps), progress):
+                    print(line, flush=True)
+        except InputError as error:
+            errors.append(error)
+    if errors:
+        raise InputErrors(errors)
     return 0
 
 

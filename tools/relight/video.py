@@ -14,7 +14,8 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], fps: int) -> None:
     """sRGB-coded uint8 pictures [h, w, 3] of one even size -> path (.mp4)."""
     unfinished = path.with_name(f".{path.name}.partial")
     try:
-        with av.open(str(unfinished), "w", format="mp4") as container:
+        # The index in front, so that a browser plays it while it loads.
+        with av.open(str(unfinished), "w", format="mp4", options={"movflags": "+faststart"}) as container:
             stream = None
             for picture in pictures:
                 if stream is None:
