@@ -351,7 +351,7 @@ def check(job: Job) -> None:
     if errors := [str(fault) for fault in found.faults if fault.fatal]:
         raise LimnError("the result does not pass its checks: " + "; ".join(errors))
     for fault in found.faults:
-        job.note(f"{fault}; {fault.mend}")
+        job.note(f"{fault}; {fault.hint}")
 
 
 if __name__ == "__main__":

@@ -41,12 +41,12 @@ _UNREADABLE = (AttributeError, IndexError, KeyError, OSError, RuntimeError, Type
 
 @dataclass(frozen=True)
 class ExportFault:
-    """file: relative to the export. what: the sentence. mend: what to do about it. fatal: nothing with this fault is
+    """file: relative to the export. what: the sentence. hint: what to do about it. fatal: nothing with this fault is
     published; else the file can be used, and a person should know."""
 
     file: str
     what: str
-    mend: str = AGAIN
+    hint: str = AGAIN
     fatal: bool = True
 
     def __str__(self) -> str:
@@ -125,8 +125,8 @@ class _Checks:
                 what = error.what if isinstance(error, InputError) else " ".join(f"{error}".split())
                 self.fault(file, f"cannot be read: {what or type(error).__name__}")
 
-    def fault(self, file: str, what: str, mend: str = AGAIN, fatal: bool = True) -> None:
-        self.found.faults.append(ExportFault(file, what, mend, fatal))
+    def fault(self, file: str, what: str, hint: str = AGAIN, fatal: bool = True) -> None:
+        self.found.faults.append(ExportFault(file, what, hint, fatal))
 
     def headers(self) -> None:
         """Of every EXR: channels, colour space, unit, content."""

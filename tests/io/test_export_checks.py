@@ -168,7 +168,7 @@ def test_every_fault_is_named(export, words, plant):
 def test_only_overlap_is_no_reason_to_withhold_a_result(export):
     mesh(lambda m: m.replace(uvs=np.abs(m.uvs - 0.25)))(export)
     (fault,) = check_export(export).faults
-    assert not fault.fatal and "lay out the UVs" in fault.mend
+    assert not fault.fatal and "lay out the UVs" in fault.hint
 
 
 def test_what_is_switched_off_is_said_and_no_fault(export):

@@ -105,6 +105,6 @@ def _content(
     spoilt = [Path(path).relative_to(export).as_posix() for path in damaged]
     older = version is None or version < STAGE.version
     found = check_export(export, spoilt, older)
-    faults = [InputError(fault.what, where=str(export / fault.file), hint=fault.mend) for fault in found.faults]
+    faults = [InputError(fault.what, where=str(export / fault.file), hint=fault.hint) for fault in found.faults]
     by = f"export_usd {version} wrote it, this is {STAGE.version}"
     return found.facts, found.unchecked + [by] * bool(older and found.unchecked), faults
