@@ -26,6 +26,12 @@ _ATTRIBUTES = {"POSITION": "VEC3", "NORMAL": "VEC3", "TANGENT": "VEC4", "TEXCOOR
 _MORPHED = ("POSITION", "NORMAL", "TANGENT")
 _PATHS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3", "weights": "SCALAR"}
 _TRIANGLES = 4
+_PLACES = {"translation": 3, "rotation": 4, "scale": 3, "matrix": 16}
+_INTERPOLATIONS = ("LINEAR", "STEP", "CUBICSPLINE")
+_WRAPS = (33071, 33648, 10497)
+_SAMPLING = {"magFilter": (9728, 9729), "minFilter": (9728, 9729, 9984, 9985, 9986, 9987), "wrapS": _WRAPS,
+             "wrapT": _WRAPS}
+_TARGETS = (34962, 34963)
 _MAGIC = {"image/png": b"\x89PNG\r\n\x1a\n", "image/jpeg": b"\xff\xd8\xff"}
 _UNIT_TOLERANCE = 1e-3
 _MISBUILT = (AttributeError, IndexError, KeyError, MemoryError, OverflowError, RecursionError, TypeError, ValueError)
@@ -134,6 +140,8 @@ class _Glb:
             end = view.get("byteOffset", 0) + view["byteLength"]
             if view.get("byteOffset", 0) < 0 or view["byteLength"] < 1 or end > len(self.binary):
                 yield f"{where}: ends at byte {end} of {len(self.binary)}"
+            if view.get("target", _TARGETS[0]) not in _TARGETS:
+                yield f"{where}/target: {view['target']}, not among those of glTF"
             if stride % 4 or not 4 <= stride <= 252:
                 yield f"{where}: stride {stride}, expected a multiple of 4 from 4 to 252"
 
@@ -228,6 +236,11 @@ class _Glb:
             yield from self.missing(f"/textures/{place}/source", "images", texture.get("source"))
             if "sampler" in texture:
                 yield from self.missing(f"/textures/{place}/sampler", "samplers", texture["sampler"])
+
+        for place, sampler in enumerate(self.all("samplers")):
+            for name, known in _SAMPLING.items():
+                if sampler.get(name, known[0]) not in known:
+                    yield f"/samplers/{place}/{name}: {sampler[name]}, not among those of glTF"
 
     def _materials(self) -> Iterator[str]:
         for place, material in enumerate(self.all("materials")):
@@ -342,6 +355,9 @@ class _Glb:
                 yield from self.missing(f"{where}/children", "nodes", child)
                 if parents.setdefault(child, place) != place or child == place:
                     yield f"{where}/children: node {child} has two parents"
+            for key, count in _PLACES.items():
+                if key in node and np.shape(node[key]) != (count,):
+                    yield f"{where}/{key}: {len(node[key])} numbers, expected {count}"
             if "rotation" in node and abs(np.linalg.norm(node["rotation"]) - 1.0) > _UNIT_TOLERANCE:
                 yield f"{where}/rotation: no unit quaternion"
             if "matrix" in node and node.keys() & {"translation", "rotation", "scale"}:
@@ -386,7 +402,10 @@ class _Glb:
             yield f"{where}/input: no times in seconds with their min and max"
         elif times[0, 0] < 0.0 or (np.diff(times[:, 0]) <= 0.0).any():
             yield f"{where}/input: times do not rise strictly from 0 or later"
-        path, spline = target["path"], sampler.get("interpolation", "LINEAR") == "CUBICSPLINE"
+        path, interpolation = target["path"], sampler.get("interpolation", "LINEAR")
+        if interpolation not in _INTERPOLATIONS:
+            yield f"{where}/interpolation: {interpolation}, not among those of glTF"
+        spline = interpolation == "CUBICSPLINE"
         width = self._weights_of(target.get("node")) if path == "weights" else 1
         expected = len(times) * width * (3 if spline else 1)
         if output["type"] != _PATHS[path] or output["count"] != expected:
@@ -414,7 +433,9 @@ def _number_errors(where: str, accessor: Mapping, values: np.ndarray) -> Iterato
         yield f"{where}: {np.count_nonzero(~np.isfinite(values))} numbers are not finite"
         return
     for name, found in (("min", values.min(0)), ("max", values.max(0))):
-        if name in accessor and not np.array_equal(np.array(accessor[name], np.float32), found.astype(np.float32)):
+        with np.errstate(over="ignore"):
+            stated = np.array(accessor.get(name, found), np.float32)
+        if not np.array_equal(stated, found.astype(np.float32)):
             yield f"{where}/{name}: {accessor[name]} stated, {found.tolist()} found"
 
 
@@ -440,11 +461,10 @@ def _unit_errors(where: str, vectors: np.ndarray, what: str) -> Iterator[str]:
 def _texture_references(part: Mapping, name: str = "") -> Iterator[tuple[str, Mapping]]:
     """(name, reference) of every texture that a material or its extensions read."""
     for key, value in part.items():
-        if isinstance(value, dict):
-            if key.endswith("Texture"):
-                yield f"{name}{key}", value
-            else:
-                yield from _texture_references(value, f"{name}{key}/")
+        if key.endswith("Texture"):
+            yield f"{name}{key}", value if isinstance(value, dict) else {}
+        elif isinstance(value, dict):
+            yield from _texture_references(value, f"{name}{key}/")
 
 
 def _extension_names(part: object) -> Iterator[str]:

@@ -1,6 +1,7 @@
 """The exported files, read back by USD, OpenEXR and zip as another program would."""
 
 import os
+import re
 import shutil
 import subprocess
 import zipfile
@@ -560,6 +561,25 @@ def test_check_refuses_what_no_one_could_use(exported, work, tmp_path):
     with pytest.raises(LimnError, match="roughness.exr: 12 x 12 is not a square power of two.*values up to 1.5"):
         export_usd.check(job)
     assert MAP_SIZE & (MAP_SIZE - 1) == 0
+
+
+def test_check_wants_the_files_that_are_switched_on(work, tmp_path):
+    job = ToyJob(work["head"], tmp_path / "export", plates=False, views=False)
+    export_usd.run(job)
+    for name in ("head.usdz", "head.glb"):
+        (job.out / name).unlink()
+    with pytest.raises(LimnError, match="head.usdz: missing; head.glb: missing"):
+        export_usd.check(job)
+
+
+def test_check_notes_what_keeps_no_result_back(work, tmp_path, monkeypatch):
+    """The toy's UVs are folded over; its log says so, and the result is published."""
+    job, notes = ToyJob(work["head"], tmp_path / "export", plates=False, views=False), []
+    monkeypatch.setattr(job, "note", notes.append)
+    export_usd.run(job)
+    export_usd.check(job)
+    (note,) = notes
+    assert re.match(r"mesh.obj: several faces cover [\d.]+% of the texels, .*lay out the UVs", note)
 
 
 def test_mesh_errors_and_warnings():
