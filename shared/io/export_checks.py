@@ -6,13 +6,14 @@ missing where it is not there; what may be switched off, or came with a later ve
 
 from __future__ import annotations
 
+import contextlib
 import zipfile
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
-from pxr import Tf
+from pxr import Tf, UsdUtils
 
 from shared.errors import InputError, LimnError
 from shared.geometry.mesh_checks import mesh_errors, uv_overlap
@@ -101,21 +102,23 @@ class _Checks:
         self.sizes: dict[str, tuple[int, int]] = {}
 
     def files(self, *patterns: str) -> list[str]:
-        """Names of the files that match."""
-        return sorted({path.relative_to(self.folder).as_posix() for pattern in patterns
-                       for path in self.folder.glob(pattern) if path.is_file()})
+        """Names of the files that match, those that are known to be missing too."""
+        found = {path.relative_to(self.folder).as_posix() for pattern in patterns
+                 for path in self.folder.glob(pattern) if path.is_file()}
+        return sorted(found | {name for name in self.spoilt for pattern in patterns
+                               if name.count("/") == pattern.count("/") and PurePosixPath(name).match(pattern)})
 
     def of(self, file: str, check, used: Collection[str] = (), required: bool = True) -> None:
         """Lets check look at the file, if it is there and neither it nor what it uses is spoilt."""
         if damaged := [name for name in (file, *used) if name in self.spoilt]:
-            self.found.unchecked.append(f"{file} ({damaged[0]} is not as published)")
+            self.leave(file, "not as published" if damaged[0] == file else f"{damaged[0]} is not as published")
         elif file in self.unreadable:
             return
         elif not (self.folder / file).is_file():
             if required and not self.older:
                 self.fault(file, "missing")
             else:
-                self.found.unchecked.append(f"{file} (not in this export)")
+                self.leave(file, "not in this export")
         else:
             try:
                 for sentence in check(file):
@@ -124,6 +127,11 @@ class _Checks:
                 self.unreadable.add(file)
                 what = error.what if isinstance(error, InputError) else " ".join(f"{error}".split())
                 self.fault(file, f"cannot be read: {what or type(error).__name__}")
+
+    def leave(self, file: str, why: str) -> None:
+        """Says once that a file is not checked."""
+        if (sentence := f"{file} ({why})") not in self.found.unchecked:
+            self.found.unchecked.append(sentence)
 
     def fault(self, file: str, what: str, hint: str = AGAIN, fatal: bool = True) -> None:
         self.found.faults.append(ExportFault(file, what, hint, fatal))
@@ -202,15 +210,27 @@ class _Checks:
 
     def usd(self, file: str) -> list[str]:
         """usd-core's validators, the MaterialX definitions, and what both are blind to."""
-        return usd_errors(self.folder / file)
+        with _silent_usd():
+            return usd_errors(self.folder / file)
 
     def usdz(self, file: str) -> list[str]:
         """The same, and what viewers for consumers ask beyond."""
-        return usd_errors(self.folder / file) + package_errors(self.folder / file)
+        with _silent_usd():
+            return usd_errors(self.folder / file) + package_errors(self.folder / file)
 
     def glb(self, file: str) -> list[str]:
         """The rules of glTF."""
         return glb_errors(self.folder / file)
+
+
+@contextlib.contextmanager
+def _silent_usd() -> Iterator[None]:
+    """USD's own warnings stay off the terminal: the validators say in sentences what they are about."""
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        yield
+    finally:
+        delegate.TakeUncoalescedDiagnostics()
 
 
 def rigid_motions(transforms: np.ndarray) -> np.ndarray:

@@ -58,8 +58,12 @@ def test_what_is_not_as_published_is_one_line_and_stays_closed(export, capsys):
     spoil(export)
     code, lines, faults = check(capsys, export)
     assert code == 2 and len(faults) == 1 and "not as it was published" in faults[0]
-    assert "maps/roughness.exr (maps/roughness.exr is not as published)" in lines[0]
-    assert "head.usda (maps/roughness.exr is not as published)" in lines[0]
+    unchecked = ["maps/roughness.exr (not as published)", "head.usda (maps/roughness.exr is not as published)",
+                 "head.usdz (not in this export)"]
+    assert lines == [f"{export}: not checked: {', '.join(unchecked)}"]
+    (export / "maps" / "roughness.exr").unlink()
+    code, again, faults = check(capsys, export)
+    assert code == 2 and again == lines and faults == [f"limn: {export}/maps/roughness.exr: the file is missing"]
 
 
 def test_exports_of_older_versions_are_checked_as_far_as_they_go(export, capsys):
@@ -83,3 +87,12 @@ def test_one_faulty_export_does_not_hide_the_others(original, export, capsys):
     write_sums(export)
     code, lines, faults = check(capsys, export, original)
     assert code == 2 and len(faults) == 1 and str(original) in lines[-1] and "as published" in lines[-1]
+
+
+def test_what_nobody_published_stays_closed(export, capsys):
+    (export / "head.usdz").write_bytes(b"PK")
+    (export / "maps" / "extra.exr").symlink_to("/dev/zero")
+    code, lines, faults = check(capsys, export)
+    assert (code, faults) == (0, [])
+    assert "not checked: head.usdz, maps/extra.exr" in lines[0]
+    assert "head.usdz (not as published)" in lines[1] and "as published" in lines[2]

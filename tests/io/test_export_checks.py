@@ -200,7 +200,7 @@ def test_damaged_files_stay_closed(export):
     found = check_export(export, spoilt=("head_geo.usdc", "head.glb"))
     assert found.faults == []
     assert found.unchecked == ["head.usda (head_geo.usdc is not as published)",
-                               "head.glb (head.glb is not as published)"]
+                               "head.glb (not as published)"]
 
 
 def test_rigid_motions():
@@ -210,3 +210,9 @@ def test_rigid_motions():
     assert rigid_motions(broken).tolist() == [False, False, False, True]
     broken[3, 0, 0] = np.inf
     assert not rigid_motions(broken).any()
+
+
+def test_usd_says_nothing_beside_the_sentences(export, capfd):
+    (export / "maps" / "roughness.exr").unlink()
+    assert any("roughness" in str(fault) for fault in check_export(export).faults if fault.file == "head.usda")
+    assert capfd.readouterr() == ("", "")

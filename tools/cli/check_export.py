@@ -58,13 +58,15 @@ def _check(export: Path, hashes_only: bool) -> tuple[list[str], list[InputError]
         return [], [error]
     except OSError as error:
         return [], [InputError("cannot be read", where=str(error.filename or export), got=error.strerror)]
-    lines = _unlisted(export, sorted(set(names) - {*sums, SUMS})) if sums else []
+    more = sorted(set(names) - {*sums, SUMS}) if sums else []
+    lines = _unlisted(export, more)
     facts = [f"{len(sums)} files are as published"] if sums else [
         f"no {SUMS} (export_usd {version} wrote none): nobody can tell whether files are as published"]
     if not hashes_only and {*sums, *names} & {*_OF_A_HEAD}:
-        more, unchecked, faults = _content(export, version, [error.where for error in errors])
+        damaged = [Path(error.where).relative_to(export).as_posix() for error in errors]
+        found, unchecked, faults = _content(export, version, [*damaged, *more])
         errors += faults
-        facts += more
+        facts += found
         lines += [f"{export}: not checked: {', '.join(unchecked)}"] if unchecked else []
     if not errors:
         own = [f"SHA-256 of {SUMS}: {hash_file(export / SUMS)}"] if sums else []
@@ -96,15 +98,15 @@ def _unlisted(export: Path, more: Sequence[str]) -> list[str]:
 
 
 def _content(
-    export: Path, version: int | None, damaged: Sequence[str]
+    export: Path, version: int | None, closed: Sequence[str]
 ) -> tuple[list[str], list[str], list[InputError]]:
-    """What is in the files: facts, what could not be checked, faults. damaged: paths of files that stay closed."""
+    """What is in the files: facts, what could not be checked, faults. closed: files that are not opened, since they
+    are damaged or nobody published them."""
     from shared.io.export_checks import check_export
     from stages.export_usd import STAGE
 
-    spoilt = [Path(path).relative_to(export).as_posix() for path in damaged]
     older = version is None or version < STAGE.version
-    found = check_export(export, spoilt, older)
+    found = check_export(export, closed, older)
     faults = [InputError(fault.what, where=str(export / fault.file), hint=fault.hint) for fault in found.faults]
     by = f"export_usd {version} wrote it, this is {STAGE.version}"
     return found.facts, found.unchecked + [by] * bool(older and found.unchecked), faults
