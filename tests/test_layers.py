@@ -23,6 +23,7 @@ MAY_IMPORT = {
     "shared.io": "geometry imaging",
     "shared.capture": "contract compute geometry imaging io",
     "shared.tracking": "contract compute geometry io capture",
+    "shared.actions": "geometry tracking",
     "shared.rendering": "compute geometry imaging",
     "shared.appearance": "compute geometry imaging capture rendering",
     "shared.shape": "compute geometry imaging tracking rendering appearance",

@@ -85,6 +85,7 @@ REFERENCES = {
     "Molder2021": "Mölder et al., Sustainable data analysis with Snakemake. F1000Research 10:33, 2021.",
     "Munkberg2022": "Munkberg et al., Extracting Triangular 3D Models, Materials, and Lighting From Images. CVPR 2022.",
     "Nicolet2021": "Nicolet, Jacobson, Jakob, Large Steps in Inverse Rendering of Geometry. SIGGRAPH Asia 2021.",
+    "Noh2001": "Noh, Neumann, Expression Cloning. SIGGRAPH 2001.",
     "Paszke2019": "Paszke et al., PyTorch: An Imperative Style, High-Performance Deep Learning Library. NeurIPS 2019.",
     "Ramamoorthi2001":
         "Ramamoorthi, Hanrahan, An Efficient Representation for Irradiance Environment Maps. SIGGRAPH 2001.",
@@ -97,6 +98,7 @@ REFERENCES = {
         "Rüfer, Schröder, Erb, White-to-White Corneal Diameter: Normal Values in Healthy Humans Obtained with the "
         "Orbscan II Topography System. Cornea 24, 2005.",
     "Saad2003": "Saad, Iterative Methods for Sparse Linear Systems, second edition. SIAM, 2003.",
+    "Schaefer2006": "Schaefer, McPhail, Warren, Image Deformation Using Moving Least Squares. SIGGRAPH 2006.",
     "Schlick1994":
         "Schlick, An Inexpensive BRDF Model for Physically-based Rendering. Computer Graphics Forum 13, 1994.",
     "Shi1994": "Shi, Tomasi, Good Features to Track. CVPR 1994.",

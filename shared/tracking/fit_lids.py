@@ -52,8 +52,9 @@ class LidMargins:
     fronts: tuple[tuple[tuple[np.ndarray, np.ndarray], ...], ...]
 
     @classmethod
-    def of(cls, model: HeadModel) -> LidMargins | None:
-        """None where the model has no lids with sockets behind them."""
+    def of(cls, model: HeadModel, splits: int = 0) -> LidMargins | None:
+        """None where the model has no lids with sockets behind them. splits: how many times finer the model is than
+        the one that is tracked with."""
         if not {"lids", "eye_sockets"} <= set(model.segment_names):
             return None
         edges, edge_of_face, _ = mesh_edges(model.faces)
@@ -61,24 +62,24 @@ class LidMargins:
         right = model.template[rim[:, 0], 0] < 0
         loops = tuple(_halves(rim[own], model.template) for own in (right, ~right))
         lids = model.faces[model.segment("lids")]
-        return cls(loops, tuple(_fronts(halves, lids, model.template) for halves in loops))
+        return cls(loops, tuple(_fronts(halves, lids, model.template, 2**splits) for halves in loops))
 
 
 def _fronts(
-    halves: tuple[np.ndarray, np.ndarray], faces: np.ndarray, template: np.ndarray
+    halves: tuple[np.ndarray, np.ndarray], faces: np.ndarray, template: np.ndarray, times: int
 ) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Of both halves: vertices so many edges away along faces [F, 3] that are nearer to this half than to the other,
-    but not to a corner, with the share of the way at which the half's nearest vertex lies."""
+    """Of both halves: vertices so many edges, times as many, away along faces [F, 3] that are nearer to this half than
+    to the other, but not to a corner, with the share of the way at which the half's nearest vertex lies."""
     rings = [np.unique(np.concatenate(halves))]
     reached = rings[0]
-    for _ in range(max(FRONT_EDGES)):
+    for _ in range(times * max(FRONT_EDGES)):
         rings.append(np.setdiff1d(faces[np.isin(faces, reached).any(1)], reached))
         reached = np.union1d(reached, rings[-1])
     trees, found = [cKDTree(template[half, :2]) for half in halves], []
     for own, other, half, edges in zip(trees, trees[::-1], halves, FRONT_EDGES, strict=True):
-        (apart, at), (elsewhere, _) = (tree.query(template[rings[edges], :2]) for tree in (own, other))
+        (apart, at), (elsewhere, _) = (tree.query(template[rings[times * edges], :2]) for tree in (own, other))
         chosen = (apart < elsewhere) & (at > 0) & (at < len(half) - 1)
-        found.append((rings[edges][chosen], at[chosen] / (len(half) - 1)))
+        found.append((rings[times * edges][chosen], at[chosen] / (len(half) - 1)))
     return tuple(found)
 
 
@@ -167,7 +168,7 @@ def lay_lids(plate: ThinPlate, margins: LidMargins, vertices: np.ndarray, contou
     if not held:
         return vertices
     held, first = np.unique(np.concatenate(held), return_index=True)
-    return vertices + _followed(plate, held, np.concatenate(targets)[first] - vertices[held])
+    return vertices + followed(plate, held, np.concatenate(targets)[first] - vertices[held])
 
 
 def _open(
@@ -223,7 +224,7 @@ def _way(line: np.ndarray) -> np.ndarray:
     return way / way[-1]
 
 
-def _followed(plate: ThinPlate, held: np.ndarray, moves: np.ndarray) -> np.ndarray:
+def followed(plate: ThinPlate, held: np.ndarray, moves: np.ndarray) -> np.ndarray:
     """Displacements [V, 3]: of held [n] vertices near moves [n, 3], of lids and sockets as a plate, none elsewhere."""
     model = plate.model
     soft = model.segment("lids", "eye_sockets")

@@ -1,0 +1,75 @@
+"""The facial actions of a solved head, as blend shapes with ARKit's names.
+
+They come from the head model: carried over to the solved head (transfer), lids kept about the eyeballs (eyelids), lips
+kept from passing through each other (lips). The head at rest is the solved one, whatever its expression is: eyes that
+are half shut in it need half of a blink. Eyeballs do not move; they turn as parts of their own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from shared.actions.eyelids import HALF, Eyelids
+from shared.actions.lips import LipContact
+from shared.actions.names import named_actions
+from shared.actions.transfer import carried, local_similarities
+from shared.geometry.blend_shapes import BlendShape
+from shared.geometry.eyeballs import SIDES
+from shared.tracking.head_model import HeadModel
+
+LEAST_MM = 0.01
+"""A vertex moves if it does so by more than this."""
+HIDDEN = ("eyes", "eye_sockets", "inner_mouth")
+"""Nobody sees how these lie in a solved head: they do not count where it is compared with the model."""
+BLINKS = tuple(f"eyeBlink{side.capitalize()}" for side in SIDES)
+"""Of the right and the left eye."""
+
+
+def levels_of(model: HeadModel, faces: np.ndarray) -> list[HeadModel]:
+    """The head model subdivided once, twice and so on until it has these faces [F, 3]; empty where it never has.
+
+    model: at its coarsest level. Of the identities one is left, to save time and memory.
+    """
+    levels = [replace(model, identity_basis=model.identity_basis[:1])]
+    while len(levels[-1].faces) < len(faces):
+        levels.append(levels[-1].subdivided())
+    return levels[1:] if np.array_equal(levels[-1].faces, faces) else []
+
+
+def facial_actions(model: HeadModel, vertices: np.ndarray, faces: np.ndarray) -> tuple[BlendShape, ...]:
+    """Of the head with vertices [V, 3] mm and faces [F, 3]; none where these are not the model's, subdivided.
+
+    model: the head model at its coarsest level.
+    """
+    levels = levels_of(model, faces)
+    if not levels:
+        return ()
+    finer, vertices = levels[-1], np.asarray(vertices, np.float64)
+    maps, lids = _maps(model, levels, vertices), Eyelids.of(finer, vertices, splits=len(levels) - 1)
+    lips, still = LipContact.of(finer, vertices), finer.surface(vertices).vertices_of(("eyes",))
+    shapes = []
+    for name, moves in named_actions(finer).items():
+        moved, between = np.where(still[:, None], 0.0, carried(moves, maps)), ()
+        if lids is not None and name in BLINKS:
+            moved, half = lids.blink(BLINKS.index(name), moves, moved)
+            between = ((HALF, half),)
+        elif lids is not None:
+            moved = lids.clear_of_balls(moved)
+        if lips is not None and lips.moved_by(moved):
+            moved = lips.parted(vertices + moved) - vertices
+        shapes.append(BlendShape.of(name, moved, LEAST_MM, between))
+    return tuple(shape for shape in shapes if len(shape.vertices))
+
+
+def _maps(model: HeadModel, levels: list[HeadModel], vertices: np.ndarray) -> np.ndarray:
+    """[V, 3, 3] from displacements of the model to those of the head, found at the coarsest level's vertices:
+    subdivision keeps them as the first ones."""
+    count = len(model.template)
+    seen = model.surface(model.template)
+    seen = seen.vertices_of([name for name in model.segment_names if name not in HIDDEN])
+    maps = local_similarities(levels[-1].template[:count], vertices[:count], seen).reshape(count, 9)
+    for level in levels:
+        maps = level.from_coarser @ maps
+    return maps.reshape(-1, 3, 3)

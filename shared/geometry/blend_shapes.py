@@ -1,0 +1,52 @@
+"""Blend shapes: how a mesh's vertices move as one action goes from nothing, 0, to all of it, 1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class BlendShape:
+    """vertices [n] int, in order: those that move; offsets [n, 3] float32 mm at weight 1. between: (weight in (0, 1),
+    offsets [n, 3]) in order, in-betweens where the way there is not straight."""
+
+    name: str
+    vertices: np.ndarray
+    offsets: np.ndarray
+    between: tuple[tuple[float, np.ndarray], ...] = ()
+
+    @classmethod
+    def of(
+        cls, name: str, moves: np.ndarray, least_mm: float, between: tuple[tuple[float, np.ndarray], ...] = ()
+    ) -> BlendShape:
+        """From displacements moves [V, 3] mm and those of in-betweens, of vertices that one of them moves by more than
+        least_mm."""
+        largest = np.max([np.linalg.norm(each, axis=1) for each in (moves, *(own for _, own in between))], axis=0)
+        used = np.nonzero(largest > least_mm)[0]
+        return cls(name, used.astype(np.int32), moves[used].astype(np.float32),
+                   tuple((weight, own[used].astype(np.float32)) for weight, own in between))
+
+    def at(self, weight: float) -> np.ndarray:
+        """[n, 3] mm at a weight in [0, 1]: straight from one in-between to the next, as USD has it."""
+        weights = [0.0, *(place for place, _ in self.between), 1.0]
+        knots = [np.zeros_like(self.offsets), *(own for _, own in self.between), self.offsets]
+        k = min(int(np.searchsorted(weights, weight, side="right")) - 1, len(weights) - 2)
+        share = (weight - weights[k]) / (weights[k + 1] - weights[k])
+        return (1.0 - share) * knots[k] + share * knots[k + 1]
+
+    def applied(self, vertices: np.ndarray, weight: float) -> np.ndarray:
+        """Vertices [V, 3] mm with the action at a weight in [0, 1]."""
+        moved = np.array(vertices, np.float64)
+        moved[self.vertices] += self.at(weight)
+        return moved
+
+    def of_part(self, part: np.ndarray, count: int) -> BlendShape:
+        """The same for a mesh of the vertices part [m] alone, out of count: its first vertex is part[0]."""
+        place = np.full(count, -1)
+        place[part] = np.arange(len(part))
+        moved = place[self.vertices]
+        order = np.argsort(moved)[np.count_nonzero(moved < 0):]
+        return replace(self, vertices=moved[order].astype(np.int32), offsets=self.offsets[order],
+                       between=tuple((weight, own[order]) for weight, own in self.between))

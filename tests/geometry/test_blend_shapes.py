@@ -1,0 +1,39 @@
+"""Blend shapes: sparse, with in-betweens, of a mesh or a part of it."""
+
+import numpy as np
+
+from shared.geometry.blend_shapes import BlendShape
+
+MOVES = np.array([[0.0, 0, 0], [4.0, 0, 0], [0.0, 2, 0], [0.004, 0, 0], [0.0, 0, 1]])
+HALF = np.array([[0.0, 0, 0], [1.0, 1, 0], [0.0, 1, 0], [0.0, 0, 0], [0.0, 0, 1]])
+SHAPE = BlendShape.of("blink", MOVES, 0.01, ((0.5, HALF),))
+
+
+def test_what_hardly_moves_is_left_out():
+    np.testing.assert_array_equal(SHAPE.vertices, [1, 2, 4])
+    assert SHAPE.offsets.dtype == np.float32
+    np.testing.assert_array_equal(SHAPE.offsets, MOVES[[1, 2, 4]])
+
+
+def test_the_way_leads_through_the_in_between():
+    for weight, expected in ((0.0, 0 * MOVES), (0.25, HALF / 2), (0.5, HALF), (0.75, (HALF + MOVES) / 2), (1.0, MOVES)):
+        np.testing.assert_allclose(SHAPE.at(weight), expected[[1, 2, 4]], atol=1e-7)
+    straight = BlendShape.of("jaw", MOVES, 0.01)
+    np.testing.assert_allclose(straight.at(0.3), 0.3 * MOVES[[1, 2, 4]], atol=1e-7)
+
+
+def test_applied_moves_the_rest_nowhere():
+    rest = np.arange(15.0).reshape(5, 3)
+    moved = SHAPE.applied(rest, 1.0)
+    np.testing.assert_array_equal(moved[[0, 3]], rest[[0, 3]])
+    np.testing.assert_allclose(moved[1], rest[1] + [4.0, 0, 0])
+
+
+def test_a_part_has_its_own_numbers():
+    part = SHAPE.of_part(np.array([0, 2, 3, 4]), 5)
+    np.testing.assert_array_equal(part.vertices, [1, 3])
+    np.testing.assert_array_equal(part.offsets, MOVES[[2, 4]])
+    np.testing.assert_array_equal(part.between[0][1], HALF[[2, 4]])
+    shuffled = SHAPE.of_part(np.array([4, 1]), 5)
+    np.testing.assert_array_equal(shuffled.vertices, [0, 1])
+    np.testing.assert_array_equal(shuffled.offsets, MOVES[[4, 1]])
