@@ -6,8 +6,9 @@ Reads    sample_frames: frames.json and the frames (for the plates and the repor
          light of each.
 Writes   head.usda with its payload, head.usdz, head.glb, mesh.obj, maps/*.exr, envmap.exr, envmaps/*.exr, poses.npz,
          plates/*.jpg, renders/*.exr, views/*.exr, run.json, methods.txt, report.html.
-Method   Units, axes, colour spaces and sources are stated on everything that is written; then the asset is validated
-         as a stranger would find it on disk.
+Method   The head model's facial actions are carried over to the solved head, where the mesh is the model's, and written
+         as blend shapes. Units, axes, colour spaces and sources are stated on everything that is written; then the
+         asset is validated as a stranger would find it on disk.
 Fails    values that are not finite, a mesh with broken indices or UVs, a map that is not a square power of two,
          anything that usd-core's validators or the MaterialX definitions object to.
 """
@@ -18,23 +19,26 @@ import time
 from pathlib import Path
 
 from shared.contract import Job, Output, Parameter, Stage, main
+from shared.contract.models import HEAD_MODEL_FILE
 from shared.contract.records import EXPORTED_POSES, RUN
 from shared.errors import LimnError
 
 STAGE = Stage(
     name="export_usd",
-    version=7,
+    version=8,
     help="The head as USD, glTF, OBJ and EXR, with a report to judge it by.",
     inputs=("sample_frames", "track_landmarks", "init_albedo", "inverse_render"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
+    models=(HEAD_MODEL_FILE,),
     outputs=(
         Output("head.usda", "light, camera and motion; loads the next three", unit="mm", space="world"),
         Output("head_payload.usda", "payload of head.usda: joins the next two"),
-        Output("head_geo.usdc", "the mesh; head and eyes where the gaze is known", unit="mm", space="head"),
+        Output("head_geo.usdc", "the mesh and its blend shapes; head and eyes where the gaze is known", unit="mm",
+               space="head"),
         Output("head_mtl.usda", "the materials"),
         Output("head.usdz", "all of head.usda and its textures in one file; absent when usdz is off", optional=True),
-        Output("head.glb", "mesh, textures, lens and motion as binary glTF; absent when glb is off", unit="m",
-               optional=True),
+        Output("head.glb", "mesh, morph targets, textures, lens and motion as binary glTF; absent when glb is off",
+               unit="m", optional=True),
         Output("mesh.obj", "the mesh with its UVs; groups for head and eyes", unit="mm", space="head"),
         Output("maps/*.exr", "texture maps, v up", space="uv", colour_space="in each file"),
         Output("maps/png/*.png", "integer copies of the maps; absent unless png_copies", space="uv", optional=True),
@@ -63,6 +67,7 @@ STAGE = Stage(
         Parameter("png_copies", str, "none", "Also write the maps as PNG.", choices=("none", "8", "16"), unit="bits"),
         Parameter("usdz", bool, True, "Also pack everything into head.usdz."),
         Parameter("glb", bool, True, "Also write binary glTF."),
+        Parameter("actions", bool, True, "Also write facial actions as blend shapes, if the mesh is the head model's."),
         Parameter("plates", bool, True, "Also write the clip's frames, shown behind the head in USD as a guide."),
         Parameter("views", bool, True, "Also render the head from the side and under other lights."),
         Parameter("view_size", int, 512, "Edge of those pictures.", "px", 64, 4096),
@@ -96,6 +101,23 @@ def read_eyeballs(job: Job, mesh) -> tuple:
         return ()
     names = read_json(job.input("track_landmarks") / "tracking.json")["segments"]
     return eyeballs_of(Surface(mesh, segment, tuple(names))) or ()
+
+
+def find_actions(job: Job, mesh) -> tuple[tuple, dict]:
+    """The facial actions as blend shapes of the mesh, and what run.json says of them; nothing when switched off."""
+    from shared.actions.facial import facial_actions
+    from shared.actions.names import lacking_names
+    from shared.io.arrays import load_arrays
+    from shared.tracking.models import load_head_model
+
+    if not job.params.actions:
+        return (), {}
+    shapes = ()
+    if "face_segment" in load_arrays(job.input("inverse_render") / "mesh.npz"):
+        shapes = facial_actions(load_head_model(), mesh.vertices, mesh.faces)
+    names = [shape.name for shape in shapes]
+    note = "" if names else "the mesh is not the head model's: it has no facial actions"
+    return shapes, {"names": names, "lacking": lacking_names(tuple(names)), "note": note}
 
 
 def write_images(job: Job, writer, maps: dict, envmap, frames, render_frames: list[int]) -> None:
@@ -139,8 +161,9 @@ def near_lamp(solve: dict):
     return BallLamp(tuple(lamp["position_mm"]), lamp["radius_mm"], tuple(lamp["radiance"]))
 
 
-def describe_asset(job: Job, mesh, eyes, capture, frames, writer, lamp):
-    """The asset that head.usda and head.usdz hold; writes the plates. lamp: what stands near of the light, or None."""
+def describe_asset(job: Job, mesh, eyes, actions, capture, frames, writer, lamp):
+    """The asset that head.usda and head.usdz hold; writes the plates. actions: its blend shapes; lamp: what stands near
+    of the light, or None."""
     from shared.io.plates import crop_rectangle, write_plates
     from shared.io.usd import HeadAsset
     from shared.io.usd_capture import Plate
@@ -161,7 +184,7 @@ def describe_asset(job: Job, mesh, eyes, capture, frames, writer, lamp):
         "confidence_map": f"maps/{writer.file_name('confidence')}",
     }
     light = TextureFile("./envmap.exr" if lamp is None else "./envmap_far.exr", writer.colour_space)
-    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, lamp, eyes,
+    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, lamp, eyes, actions,
                      version=str(STAGE.version), metadata=metadata)
 
 
@@ -181,7 +204,7 @@ def write_assets(job: Job, asset, eyeballs, poses: dict, maps: dict, envmap) -> 
     if job.params.usdz:
         write_head_usdz(job.out / "head.usdz", asset, maps, envmap)
     if job.params.glb:
-        write_glb(job.out / "head.glb", asset.name, asset.mesh, maps, asset.capture, asset.eyes)
+        write_glb(job.out / "head.glb", asset.name, asset.mesh, maps, asset.capture, asset.eyes, asset.actions)
 
 
 def light_moves(job: Job, moves: str) -> str:
@@ -240,9 +263,9 @@ def write_lights(job: Job, writer, envmap, clips: list) -> None:
             writer.write_colour(job.out / "envmaps" / f"{name}.exr", light, "radiance, clip maximum 1", latlong=True)
 
 
-def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
-    """The content of run.json: what each stage was told, what it took, what it found. own_seconds: what this stage
-    took so far."""
+def run_record(job: Job, mesh, actions: dict, solve: dict, own_seconds: float) -> dict:
+    """The content of run.json: what each stage was told, what it took, what it found. actions: what find_actions says
+    of them; own_seconds: what this stage took so far."""
     from shared.geometry.mesh_checks import mesh_warnings
     from shared.report.content import own_record, selection_record, stage_record, warnings_of
 
@@ -259,7 +282,7 @@ def run_record(job: Job, mesh, solve: dict, own_seconds: float) -> dict:
     records[STAGE.name] = own
     kept = ("model", "residuals", "lamp", "albedo_scale", "held_out_frames", "clips")
     chosen = {key: solve[key] for key in kept if key in solve}
-    chosen |= head_scale_record(job, solve)
+    chosen |= head_scale_record(job, solve) | ({"actions": actions} if actions else {})
     if selection := selection_record(job.input("inverse_render"), solve):
         chosen["model_selection"] = selection
     return {
@@ -327,10 +350,11 @@ def run(job: Job) -> None:
         writer.write_colour(job.out / "envmap_far.exr", far, "radiance, clip maximum 1", latlong=True)
     eyeballs = read_eyeballs(job, mesh)
     eyes = eyeballs if "eye_turn" in poses else ()
-    asset = describe_asset(job, mesh, eyes, describe_capture(job, poses, frames), frames, writer, lamp)
+    actions, said_of_them = find_actions(job, mesh)
+    asset = describe_asset(job, mesh, eyes, actions, describe_capture(job, poses, frames), frames, writer, lamp)
     write_assets(job, asset, eyeballs, poses, maps, far)
     views = render_views(job, writer, mesh, eyes, maps, envmap, poses, frames, solve)
-    record = run_record(job, mesh, solve, time.perf_counter() - start)
+    record = run_record(job, mesh, said_of_them, solve, time.perf_counter() - start)
     write_json(job.out / "run.json", record)
     methods = method_records(job, record, solve)
     (job.out / "methods.txt").write_text(methods_text(methods), encoding="utf-8")

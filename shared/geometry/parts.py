@@ -17,12 +17,13 @@ HEAD, EYES = "head", tuple(f"eye_{side}" for side in SIDES)
 @dataclass(frozen=True, eq=False)
 class RigidPart:
     """mesh: its vertices in the axes of head space, counted from the pivot [3] mm that the part turns about; normals
-    [V, 3]: those that the vertices have in the whole mesh."""
+    [V, 3]: those that the vertices have in the whole mesh; vertices [V] int: which ones of it they are."""
 
     name: str
     mesh: Mesh
     normals: np.ndarray
     pivot: np.ndarray
+    vertices: np.ndarray
 
 
 def head_parts(mesh: Mesh, eyes: Sequence[Eyeball] = ()) -> tuple[RigidPart, ...]:
@@ -32,7 +33,7 @@ def head_parts(mesh: Mesh, eyes: Sequence[Eyeball] = ()) -> tuple[RigidPart, ...
     """
     normals = shading_normals(mesh)
     if not eyes:
-        return (RigidPart(HEAD, mesh, normals, np.zeros(3)),)
+        return (RigidPart(HEAD, mesh, normals, np.zeros(3), np.arange(len(mesh.vertices))),)
     rest = np.ones(len(mesh.faces), bool)
     for eye in eyes:
         rest[eye.faces] = False
@@ -45,7 +46,7 @@ def _part(mesh: Mesh, normals: np.ndarray, name: str, faces: np.ndarray, pivot: 
     used, corners = np.unique(mesh.faces[faces], return_inverse=True)
     used_uvs, uv_corners = np.unique(mesh.face_uvs[faces], return_inverse=True)
     part = Mesh(mesh.vertices[used] - pivot, corners.reshape(-1, 3), mesh.uvs[used_uvs], uv_corners.reshape(-1, 3))
-    return RigidPart(name, part, normals[used], pivot)
+    return RigidPart(name, part, normals[used], pivot, used)
 
 
 def part_runs(face_count: int, eyes: Sequence[Eyeball]) -> list[tuple[str, int, int]]:

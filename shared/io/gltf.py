@@ -7,6 +7,10 @@ the format cannot say: a shifted principal point and an environment light; both 
 Eyeballs that are known are nodes of their own below the head's: their centre is the node's place, the gaze its
 rotation, and without the animation they look straight ahead.
 
+Facial actions are morph targets, sparse, named in the mesh's extras as exporters agreed on. glTF goes straight from 0
+to 1: an in-between is a target of its own after all others, the difference from that straight way. `eyeBlinkLeft_50`
+belongs to `eyeBlinkLeft`: with weight 1 - |2 w - 1| where that one has w.
+
 References: glTF 2.0 specification (GLB container, accessors, animations); KHR_materials_specular (F0 = min(0.04 *
 specularColor, 1) * specular); KHR_materials_ior.
 """
@@ -23,6 +27,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from shared.errors import LimnError
+from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.eyeballs import EYE_ROUGHNESS, TEAR_FILM_IOR, Eyeball
 from shared.geometry.mesh import Mesh, unique_pairs
 from shared.geometry.parts import HEAD, RigidPart, head_parts
@@ -72,6 +77,24 @@ class _Buffer:
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
+    def sparse(self, count: int, index: np.ndarray, values: np.ndarray) -> int:
+        """count vectors of 0 but those at index [n], in order, which are values [n, 3] -> index of the accessor."""
+        values = np.ascontiguousarray(values, "<f4")
+        self.accessors.append({
+            "componentType": _FLOAT,
+            "count": count,
+            "type": _KINDS[3],
+            "min": np.minimum(values.min(0), 0.0).tolist(),
+            "max": np.maximum(values.max(0), 0.0).tolist(),
+            "sparse": {
+                "count": len(index),
+                "indices": {"bufferView": self.add(np.ascontiguousarray(index, "<u4").tobytes()),
+                            "componentType": _UINT},
+                "values": {"bufferView": self.add(values.tobytes())},
+            },
+        })
+        return len(self.accessors) - 1
+
 
 def write_glb(
     path: Path | str,
@@ -80,9 +103,11 @@ def write_glb(
     maps: Mapping[str, np.ndarray],
     capture: UsdCapture,
     eyes: Sequence[Eyeball] = (),
+    actions: Sequence[BlendShape] = (),
 ) -> None:
     """One file with all inside. maps: diffuse_albedo, specular_intensity, roughness and normal, as exported; eyes: the
-    right and the left eyeball of the mesh, to be nodes of their own, or none."""
+    right and the left eyeball of the mesh, to be nodes of their own, or none; actions: blend shapes of the mesh, which
+    move no eyeball."""
     buffer = _Buffer()
     textures, skin = _material(buffer, maps)
     width, height = capture.width, capture.height
@@ -92,7 +117,10 @@ def write_glb(
         nodes[0]["children"] = [_FIRST_EYE + k for k in range(len(turning))]
         nodes += [{"name": eye.name, "mesh": 1 + k, "translation": (eye.pivot * METRES_PER_MM).tolist()}
                   for k, eye in enumerate(turning)]
-    meshes = [{"name": HEAD, "primitives": [_primitive(buffer, head, 0)]}]
+    targets = _morph_targets([shape.of_part(head.vertices, len(mesh.vertices)) for shape in actions])
+    meshes = [{"name": HEAD, "primitives": [_primitive(buffer, head, 0, list(targets.values()))]}]
+    if targets:
+        meshes[0] |= {"weights": [0.0] * len(targets), "extras": {"targetNames": list(targets)}}
     content = {
         "asset": {"version": "2.0", "generator": "Limn"},
         "scene": 0,
@@ -123,8 +151,19 @@ def write_glb(
     _write_container(Path(path), content, bytes(buffer.data))
 
 
-def _primitive(buffer: _Buffer, part: RigidPart, material: int) -> dict:
-    """glTF knows one index per corner: vertices are doubled along texture seams."""
+def _morph_targets(shapes: Sequence[BlendShape]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """{name: (vertices [n], offsets [n, 3] mm)}: the actions, then what their in-betweens add to the straight way."""
+    targets = {shape.name: (shape.vertices, shape.offsets) for shape in shapes}
+    for shape in shapes:
+        for weight, offsets in shape.between:
+            targets[f"{shape.name}_{round(100 * weight)}"] = shape.vertices, offsets - weight * shape.offsets
+    return targets
+
+
+def _primitive(
+    buffer: _Buffer, part: RigidPart, material: int, targets: Sequence[tuple[np.ndarray, np.ndarray]] = ()
+) -> dict:
+    """glTF knows one index per corner: vertices are doubled along texture seams. targets: see _morph_targets."""
     mesh = part.mesh
     corners, index, _ = unique_pairs(np.column_stack([mesh.faces.ravel(), mesh.face_uvs.ravel()]))
     vertex, coordinate = corners.T
@@ -133,7 +172,19 @@ def _primitive(buffer: _Buffer, part: RigidPart, material: int) -> dict:
         "NORMAL": buffer.array(part.normals[vertex], _ARRAY),
         "TEXCOORD_0": buffer.array(mesh.uvs[coordinate] * [1.0, -1.0] + [0.0, 1.0], _ARRAY),
     }
-    return {"attributes": attributes, "indices": buffer.array(index.astype(np.uint32), _INDEX), "material": material}
+    primitive = {"attributes": attributes, "indices": buffer.array(index.astype(np.uint32), _INDEX),
+                 "material": material}
+    if targets:
+        primitive["targets"] = [{"POSITION": _morph_target(buffer, vertex, *target)} for target in targets]
+    return primitive
+
+
+def _morph_target(buffer: _Buffer, vertex: np.ndarray, moving: np.ndarray, offsets: np.ndarray) -> int:
+    """Accessor for corners that are each a vertex [n] of the mesh."""
+    row = np.full(int(vertex.max()) + 1, -1)
+    row[moving] = np.arange(len(moving))
+    index = np.nonzero(row[vertex] >= 0)[0]
+    return buffer.sparse(len(vertex), index, offsets[row[vertex[index]]] * METRES_PER_MM)
 
 
 def _material(buffer: _Buffer, maps: Mapping[str, np.ndarray]) -> tuple[list[int], dict]:

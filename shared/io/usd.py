@@ -4,6 +4,7 @@
       payload           head_payload.usda, sublayers of head_geo.usdc and head_mtl.usda
 
     /<subject>          Xform, default prim, kind component, assetInfo, inherits /__class__/<subject>
+      geo               SkelRoot where the head has facial actions (usd_actions)
       geo/head          Mesh in millimetres, faceVarying UVs and normals
       geo/eye_right     Mesh about the eyeball's centre, which it turns about; geo/eye_left likewise
       mtl/skin          Material: UsdPreviewSurface and OpenPBR; mtl/eye likewise
@@ -13,8 +14,8 @@ The variant "clip" (the default) replays the capture: the head's (or the camera'
 samples, the light at rest, the clip on a card of purpose guide. The variant "still" leaves the head alone at head
 space's origin, for use in another scene. There, and at the default time of "clip", the eyes look straight ahead.
 
-Where the clip's gaze is not known the eyes are part of geo/head, which then moves by itself. Else geo does, an Xform,
-and carries head and eyes.
+Where the clip's gaze is not known the eyes are part of geo/head, which then moves by itself, below a scope. Else geo
+does, an Xform, and carries head and eyes. Where there are facial actions it is geo that moves in any case.
 
 References: USD Working Group, Guidelines for structuring USD assets; UsdGeomMesh, UsdGeomCamera,
 UsdLuxDomeLight, UsdGeomModelAPI.
@@ -29,12 +30,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, Vt
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
 from shared.errors import LimnError
+from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.eyeballs import Eyeball
 from shared.geometry.mesh import Mesh
 from shared.geometry.parts import EYES, HEAD, head_parts
+from shared.io.usd_actions import define_actions
 from shared.io.usd_capture import (
     BallLamp,
     Plate,
@@ -61,8 +64,8 @@ class HeadAsset:
 
     maps: {name of usd_material.SHADER_INPUTS: texture}; envmap: the dome light's texture; lamp: what stands near of the
     light and is not in that texture, or None; plate: the clip's frames, or None; eyes: the right and the left eyeball
-    of the mesh, to be meshes of their own, or none; metadata: nested dictionaries of strings, numbers and lists for the
-    root prim's customData["limn"].
+    of the mesh, to be meshes of their own, or none; actions: blend shapes of the mesh, which move no eyeball; metadata:
+    nested dictionaries of strings, numbers and lists for the root prim's customData["limn"].
     """
 
     name: str
@@ -73,6 +76,7 @@ class HeadAsset:
     plate: Plate | None = None
     lamp: BallLamp | None = None
     eyes: Sequence[Eyeball] = ()
+    actions: Sequence[BlendShape] = ()
     version: str = "1"
     metadata: Mapping[str, object] = field(default_factory=dict)
 
@@ -146,13 +150,17 @@ def _layer_metadata(stage: Usd.Stage) -> None:
 
 def _define_geometry(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None:
     geo = root.AppendChild("geo")
-    (UsdGeom.Xform if asset.eyes else UsdGeom.Scope).Define(stage, geo)
+    kind = UsdSkel.Root if asset.actions else UsdGeom.Xform if asset.eyes else UsdGeom.Scope
+    kind.Define(stage, geo)
     for part in head_parts(asset.mesh, asset.eyes):
         prim = define_mesh(stage, str(geo.AppendChild(part.name)), part.mesh, part.normals)
         if part.name in EYES:
             prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*map(float, part.pivot)))
             # The variants give its value: one that stood here would be stronger than theirs in a single layer.
             prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
+        elif asset.actions:
+            count = len(asset.mesh.vertices)
+            define_actions(stage, geo, prim, [shape.of_part(part.vertices, count) for shape in asset.actions])
 
 
 def _define_materials(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None:
@@ -240,7 +248,7 @@ def _define_capture(stage: Usd.Stage, root: Usd.Prim, asset: HeadAsset) -> None:
     if asset.plate is not None:
         define_plate(stage, str(scope.AppendChild("plate")), capture, asset.plate)
     if capture.moves == "head":
-        moved = "geo" if asset.eyes else "geo/head"
+        moved = "geo" if asset.eyes or asset.actions else "geo/head"
         head = UsdGeom.Xformable(stage.GetPrimAtPath(root.GetPath().AppendPath(moved)))
         animate(head, world_from_head_rigid(capture), capture.frame_index)
 

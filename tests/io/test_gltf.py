@@ -22,6 +22,7 @@ from toy_result import (
     toy_poses,
 )
 
+from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.eyeballs import eyeballs_of, gaze_rotation
 from shared.geometry.mesh import vertex_normals
 from shared.imaging.color import encode_srgb
@@ -205,6 +206,57 @@ def test_eyes_without_a_gaze_stay_at_rest(tmp_path):
     surface = toy_eyed_surface()
     write_glb(tmp_path / "a.glb", NAME, surface.mesh, toy_maps(), capture("head"), eyeballs_of(surface))
     assert {row["target"]["node"] for row in chunks(tmp_path / "a.glb")[0]["animations"][0]["channels"]} == {0}
+
+
+def toy_actions(count):
+    """A jaw, and a blink with an in-between."""
+    random = np.random.default_rng(4)
+    jaw, shut, half = (np.zeros((count, 3)) for _ in range(3))
+    jaw[5:90] = random.normal(0.0, 9.0, (85, 3))
+    shut[20:60], half[20:60] = random.normal(0.0, 4.0, (2, 40, 3))
+    return BlendShape.of("jawOpen", jaw, 0.0), BlendShape.of("eyeBlinkLeft", shut, 0.0, ((0.5, half),))
+
+
+def dense(content, binary, index):
+    """[N, 3] of a sparse accessor over zeros."""
+    row, values = content["accessors"][index], None
+    assert "bufferView" not in row and row["componentType"] == 5126
+    parts = []
+    for part, kind, columns in (("indices", "<u4", 1), ("values", "<f4", 3)):
+        view = content["bufferViews"][row["sparse"][part]["bufferView"]]
+        assert "target" not in view and view["byteOffset"] % 4 == 0
+        parts.append(np.frombuffer(binary, kind, row["sparse"]["count"] * columns, view["byteOffset"]))
+    assert (np.diff(parts[0].astype(int)) > 0).all()
+    values = np.zeros((row["count"], 3))
+    values[parts[0]] = parts[1].reshape(-1, 3)
+    np.testing.assert_allclose([values.min(0), values.max(0)], [row["min"], row["max"]], rtol=1e-6)
+    return values
+
+
+@pytest.mark.parametrize("eyes", [False, True])
+def test_actions_are_named_morph_targets(tmp_path, eyes):
+    """Corner by corner the offsets of the shapes, those of the in-between what it adds to the straight way."""
+    surface = toy_eyed_surface()
+    mesh, balls = (surface.mesh, eyeballs_of(surface)) if eyes else (toy_mesh(), ())
+    actions = toy_actions(len(mesh.vertices))
+    write_glb(tmp_path / "a.glb", NAME, mesh, toy_maps(), capture("head"), balls, actions)
+    write_glb(tmp_path / "b.glb", NAME, mesh, toy_maps(), capture("head"), balls)
+    (content, binary), (plain, _) = chunks(tmp_path / "a.glb"), chunks(tmp_path / "b.glb")
+    head = content["meshes"][0]
+    assert head["extras"]["targetNames"] == ["jawOpen", "eyeBlinkLeft", "eyeBlinkLeft_50"]
+    assert head["weights"] == [0.0, 0.0, 0.0]
+    (primitive,) = head["primitives"]
+    places = accessor(content, binary, primitive["attributes"]["POSITION"])
+    jaw, blink = actions
+    half = BlendShape("", blink.vertices, blink.between[0][1] - 0.5 * blink.offsets)
+    rest = mesh.vertices * 0.001
+    own = {tuple(place): k for k, place in enumerate(rest.astype(np.float32))}
+    vertex = [own[tuple(place)] for place in places]
+    for shape, target in zip((jaw, blink, half), primitive["targets"], strict=True):
+        expected = shape.applied(np.zeros_like(rest), 1.0)[vertex] * 0.001
+        np.testing.assert_allclose(dense(content, binary, target["POSITION"]), expected, atol=1e-8)
+    assert "targets" not in plain["meshes"][0]["primitives"][0] and set(plain["meshes"][0]) == {"name", "primitives"}
+    assert all("targets" not in each["primitives"][0] for each in content["meshes"][1:])
 
 
 def test_names_and_bytes(file, tmp_path, moves):

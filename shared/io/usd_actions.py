@@ -1,0 +1,63 @@
+"""Blend shapes of a head in USD.
+
+    geo                 SkelRoot: below it UsdSkel deforms meshes
+      head              Mesh with SkelBindingAPI, the names of its actions and where they are
+        <action>        BlendShape: offsets of the points that move, in-betweens
+      skeleton          Skeleton, as UsdSkel wants one; its only joint, the head itself, moves nothing
+        actions         SkelAnimation with the weight of each action, all 0: the head at rest
+
+Whoever animates the face sets `blendShapeWeights` of `actions`, or writes a SkelAnimation of their own and binds that
+one to the skeleton.
+
+Reference: UsdSkel, Schemas (Blend Shapes).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
+
+from shared.geometry.blend_shapes import BlendShape
+
+SKELETON, ANIMATION, JOINT = "skeleton", "actions", "head"
+HALF_WEIGHT, HALF_NAME = 0.5, "half"
+
+
+def define_actions(stage: Usd.Stage, root: Sdf.Path, mesh: UsdGeom.Mesh, shapes: Sequence[BlendShape]) -> None:
+    """Binds the shapes to the mesh below the SkelRoot at root; their vertices are those of the mesh."""
+    skeleton = _define_skeleton(stage, root.AppendChild(SKELETON), [shape.name for shape in shapes])
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([skeleton])
+    binding.CreateBlendShapesAttr([shape.name for shape in shapes])
+    paths = [_define_shape(stage, mesh.GetPath().AppendChild(shape.name), shape) for shape in shapes]
+    binding.CreateBlendShapeTargetsRel().SetTargets(paths)
+
+
+def _define_skeleton(stage: Usd.Stage, path: Sdf.Path, names: list[str]) -> Sdf.Path:
+    skeleton = UsdSkel.Skeleton.Define(stage, path)
+    rest = Vt.Matrix4dArray([Gf.Matrix4d(1.0)])
+    skeleton.CreateJointsAttr([JOINT])
+    skeleton.CreateBindTransformsAttr(rest)
+    skeleton.CreateRestTransformsAttr(rest)
+    animation = UsdSkel.Animation.Define(stage, path.AppendChild(ANIMATION))
+    animation.CreateBlendShapesAttr(names)
+    animation.CreateBlendShapeWeightsAttr(Vt.FloatArray(len(names), 0.0))
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    return path
+
+
+def _define_shape(stage: Usd.Stage, path: Sdf.Path, shape: BlendShape) -> Sdf.Path:
+    prim = UsdSkel.BlendShape.Define(stage, path)
+    prim.CreatePointIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(shape.vertices, np.int32)))
+    prim.CreateOffsetsAttr(_vectors(shape.offsets))
+    for weight, offsets in shape.between:
+        between = prim.CreateInbetween(HALF_NAME if weight == HALF_WEIGHT else f"at_{round(100 * weight)}")
+        between.SetWeight(weight)
+        between.SetOffsets(_vectors(offsets))
+    return path
+
+
+def _vectors(offsets: np.ndarray) -> Vt.Vec3fArray:
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(offsets, np.float32))

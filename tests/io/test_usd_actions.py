@@ -1,0 +1,115 @@
+"""Blend shapes in USD, read back and played by UsdSkel itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pxr import Usd, UsdGeom, UsdSkel, Vt
+from toy_result import FRAMES, INTRINSICS, SOURCE_SIZE, toy_eyed_surface, toy_gaze, toy_mesh, toy_poses
+
+from shared.geometry.blend_shapes import BlendShape
+from shared.geometry.eyeballs import eyeballs_of
+from shared.io.usd import HeadAsset, write_head_usda, write_single_layer
+from shared.io.usd_capture import UsdCapture, world_from_head_rigid
+from shared.io.usd_material import SHADER_INPUTS, TextureFile
+from shared.io.usd_validate import usd_errors
+
+MAPS = {name: TextureFile(f"./maps/{name}.exr") for name in SHADER_INPUTS}
+
+
+def shapes(count: int) -> tuple[BlendShape, ...]:
+    """A jaw and a blink with an in-between, of the first vertices of a mesh."""
+    random = np.random.default_rng(4)
+    jaw, shut, half = (np.zeros((count, 3)) for _ in range(3))
+    jaw[5:90] = random.normal(0.0, 9.0, (85, 3))
+    shut[20:60], half[20:60] = random.normal(0.0, 4.0, (2, 40, 3))
+    return BlendShape.of("jawOpen", jaw, 0.0), BlendShape.of("eyeBlinkLeft", shut, 0.0, ((0.5, half),))
+
+
+def asset(eyes: bool) -> HeadAsset:
+    surface = toy_eyed_surface()
+    mesh = surface.mesh if eyes else toy_mesh()
+    capture = UsdCapture(toy_poses(), FRAMES, 25.0, INTRINSICS, *SOURCE_SIZE, "head",
+                         eye_turn=toy_gaze() if eyes else None)
+    return HeadAsset("toy", mesh, MAPS, TextureFile("./envmap.exr"), capture,
+                     eyes=eyeballs_of(surface) if eyes else (), actions=shapes(len(mesh.vertices)))
+
+
+@pytest.fixture(params=[True, False], ids=["eyes", "one mesh"])
+def opened(request, tmp_path):
+    """(the asset, its stage in one layer)."""
+    own = asset(request.param)
+    write_single_layer(tmp_path / "head.usda", own)
+    stage = Usd.Stage.Open(str(tmp_path / "head.usda"))
+    yield own, stage
+    del stage
+
+
+def head_of(stage):
+    return UsdGeom.Mesh(stage.GetDefaultPrim().GetPrimAtPath("geo/head"))
+
+
+def baked(stage, **weights):
+    """Points of the head where UsdSkel has baked these weights."""
+    animation = UsdSkel.Animation(stage.GetDefaultPrim().GetPrimAtPath("geo/skeleton/actions"))
+    names = list(animation.GetBlendShapesAttr().Get())
+    animation.GetBlendShapeWeightsAttr().Set(Vt.FloatArray([weights.get(name, 0.0) for name in names]))
+    assert UsdSkel.BakeSkinning(UsdSkel.Root(stage.GetDefaultPrim().GetPrimAtPath("geo")))
+    head = head_of(stage)
+    return np.array(head.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()))
+
+
+def test_names_and_offsets(opened):
+    own, stage = opened
+    head = head_of(stage)
+    binding = UsdSkel.BindingAPI(head.GetPrim())
+    assert list(binding.GetBlendShapesAttr().Get()) == ["jawOpen", "eyeBlinkLeft"]
+    targets = binding.GetBlendShapeTargetsRel().GetTargets()
+    for shape, path in zip(own.actions, targets, strict=True):
+        prim = UsdSkel.BlendShape(stage.GetPrimAtPath(path))
+        assert path.name == shape.name
+        np.testing.assert_array_equal(prim.GetPointIndicesAttr().Get(), shape.vertices)
+        np.testing.assert_array_equal(prim.GetOffsetsAttr().Get(), shape.offsets)
+        found = [(between.GetWeight(), np.array(between.GetOffsets())) for between in prim.GetInbetweens()]
+        assert len(found) == len(shape.between)
+        for (weight, offsets), (expected_weight, expected) in zip(found, shape.between, strict=True):
+            assert weight == expected_weight
+            np.testing.assert_array_equal(offsets, expected)
+
+
+def test_the_head_at_rest_is_the_one_without_actions(opened, tmp_path):
+    """To the last bit: points, faces, texture coordinates and normals."""
+    own, stage = opened
+    write_single_layer(tmp_path / "without.usda", replace(own, actions=()))
+    without = Usd.Stage.Open(str(tmp_path / "without.usda"))
+    for attribute in head_of(without).GetPrim().GetAuthoredAttributes():
+        if not attribute.GetName().startswith(("xformOp", "skel")):
+            assert attribute.Get() == head_of(stage).GetPrim().GetAttribute(attribute.GetName()).Get()
+    animation = UsdSkel.Animation(stage.GetDefaultPrim().GetPrimAtPath("geo/skeleton/actions"))
+    assert not any(animation.GetBlendShapeWeightsAttr().Get())
+    assert not without.GetDefaultPrim().GetPrimAtPath("geo/skeleton")
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.25, 0.5, 0.8, 1.0])
+def test_usd_plays_what_the_shape_says(opened, weight):
+    own, stage = opened
+    rest = np.array(head_of(stage).GetPointsAttr().Get(), np.float64)
+    found = baked(stage, eyeBlinkLeft=weight, jawOpen=0.3)
+    jaw, blink = own.actions
+    np.testing.assert_allclose(found, blink.applied(jaw.applied(rest, 0.3), weight), atol=1e-4)
+
+
+def test_head_and_eyes_move_together(opened):
+    """The motion is that of geo, whatever hangs below it."""
+    own, stage = opened
+    for f, frame in enumerate(FRAMES):
+        transform = UsdGeom.Imageable(head_of(stage)).ComputeLocalToWorldTransform(float(frame))
+        np.testing.assert_allclose(np.array(transform).T, world_from_head_rigid(own.capture)[f], atol=1e-6)
+
+
+def test_the_layered_asset_is_sound(opened, tmp_path):
+    (tmp_path / "layers").mkdir()
+    write_head_usda(tmp_path / "layers", opened[0])
+    errors = [error for error in usd_errors(tmp_path / "layers" / "head.usda")
+              if "envmap" not in error and "/maps/" not in error]
+    assert errors == []
