@@ -1,8 +1,9 @@
 """The facial actions of a solved head, as blend shapes with ARKit's names.
 
-They come from the head model: carried over to the solved head (transfer), lids kept about the eyeballs (eyelids), lips
-kept from passing through each other (lips). The head at rest is the solved one, whatever its expression is: eyes that
-are half shut in it need half of a blink. Eyeballs do not move; they turn as parts of their own.
+They come from the head model: carried over to the solved head (transfer), lids kept about the eyeballs (eyelids), skin
+kept from folding over (folds) and lips from passing through each other (lips). The head at rest is the solved one,
+whatever its expression is: eyes that are half shut in it need half of a blink. Eyeballs do not move; they turn as parts
+of their own.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from shared.actions.crossings import TOUCHING
 from shared.actions.eyelids import HALF, Eyelids
+from shared.actions.folds import SkinFolds
 from shared.actions.lips import LipContact
 from shared.actions.names import named_actions
 from shared.actions.transfer import carried, local_similarities
@@ -48,7 +51,8 @@ def facial_actions(model: HeadModel, vertices: np.ndarray, faces: np.ndarray) ->
         return ()
     finer, vertices = levels[-1], np.asarray(vertices, np.float64)
     maps, lids = _maps(model, levels, vertices), Eyelids.of(finer, vertices, splits=len(levels) - 1)
-    lips, still = LipContact.of(finer, vertices), finer.surface(vertices).vertices_of(("eyes",))
+    lips, surface = LipContact.of(finer, vertices), finer.surface(vertices)
+    still, skin = surface.vertices_of(("eyes",)), SkinFolds.of(vertices, faces, ~surface.vertices_of(TOUCHING))
     shapes = []
     for name, moves in named_actions(finer).items():
         moved, between = np.where(still[:, None], 0.0, carried(moves, maps)), ()
@@ -56,7 +60,7 @@ def facial_actions(model: HeadModel, vertices: np.ndarray, faces: np.ndarray) ->
             moved, half = lids.blink(BLINKS.index(name), moves, moved)
             between = ((HALF, half),)
         elif lids is not None:
-            moved = lids.clear_of_balls(moved)
+            moved = skin.smoothed(lids.clear_of_balls(moved))
         if lips is not None and lips.moved_by(moved):
             moved = lips.parted(vertices + moved) - vertices
         shapes.append(BlendShape.of(name, moved, LEAST_MM, between))
