@@ -361,7 +361,7 @@ def run(job: Job) -> None:
     folders = {name: job.input(name) for name in STAGE.inputs}
     files = [(output.path, output.help) for output in STAGE.outputs]
     result = ReportInputs(job.subject.name, folders, frames, mesh, poses, maps, envmap, solve, record, files, views,
-                          clips, methods_paragraphs(methods), eyes)
+                          clips, methods_paragraphs(methods), eyes, actions)
     page = report_html(result_content(result, job.params.report_frames))
     (job.out / "report.html").write_text(page, encoding="utf-8")
 

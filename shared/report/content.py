@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.eyeballs import Eyeball
 from shared.geometry.mesh import Mesh
 from shared.geometry.transforms import WORLD_FROM_CAMERA, invert_rigid
@@ -73,10 +74,10 @@ class ReportContent:
 
     facts, numbers, files: (label, value) pairs. maps {name: [S, S] or [S, S, 3]}, envmap [H, W, 3] linear.
     angles_deg [F, 3] yaw, pitch, roll and position_mm [F, 3] at frame_index [F]. excluded: (frame, stage, reason).
-    views: None when they were not wished; relit_eyes: where its relit pictures show both eyes, as Frame.eyes. eyes: of
-    the mesh, or none. selection: the models tried, one dictionary each, in order. residuals: nested dictionaries of
-    numbers. iterations: one dictionary of numbers each. warnings: (stage, text). parameters: (stage, name, value).
-    clips: all but the first, where there are several. methods: paragraphs and references.
+    views: None when they were not wished; relit_eyes: where its relit pictures show both eyes, as Frame.eyes. eyes,
+    actions: of the mesh, or none. selection: the models tried, one dictionary each, in order. residuals: nested
+    dictionaries of numbers. iterations: one dictionary of numbers each. warnings: (stage, text). parameters: (stage,
+    name, value). clips: all but the first, where there are several. methods: paragraphs and references.
     """
 
     name: str
@@ -92,6 +93,7 @@ class ReportContent:
     views: ViewSet | None = None
     relit_eyes: tuple[int, int, int, int] | None = None
     eyes: Sequence[Eyeball] = ()
+    actions: Sequence[BlendShape] = ()
     overlay: np.ndarray | None = None
     shape: np.ndarray | None = None
     chart: np.ndarray | None = None
@@ -128,7 +130,7 @@ class ReportInputs:
 
     folders {stage: folder} of the stages before it; record: the content of run.json; files: (name, text) pairs; views:
     None when they were not wished; clips: all but the first, where there are several; methods: paragraphs, references;
-    eyes: the right and the left eyeball of the mesh, where poses say how they look, or none.
+    eyes: the right and the left eyeball of the mesh, where poses say how they look, or none; actions: its blend shapes.
     """
 
     name: str
@@ -145,6 +147,7 @@ class ReportInputs:
     clips: Sequence[ClipResult] = ()
     methods: tuple[Sequence[str], Sequence[str]] = ((), ())
     eyes: Sequence[Eyeball] = ()
+    actions: Sequence[BlendShape] = ()
 
 
 def result_content(result: ReportInputs, frame_count: int) -> ReportContent:
@@ -168,6 +171,7 @@ def result_content(result: ReportInputs, frame_count: int) -> ReportContent:
         views=result.views,
         relit_eyes=_eyes_seen_by(result.views.relit_camera, result.eyes) if result.views and result.eyes else None,
         eyes=result.eyes,
+        actions=result.actions,
         mesh=result.mesh,
         frame_index=poses["frame_index"],
         angles_deg=angles,

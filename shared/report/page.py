@@ -30,7 +30,7 @@ from shared.report.pictures import (
     viridis_bytes,
 )
 from shared.report.template import filled
-from shared.report.viewer import WET, irradiance_harmonics, packed, reduced
+from shared.report.viewer import ACTION_STEP_MM, WET, irradiance_harmonics, packed, reduced
 
 TEMPLATES = Path(__file__).with_name("templates")
 FRAME_PIXELS, MAP_PIXELS, LIGHT_PIXELS, OVERLAY_PIXELS = 440, 1024, 768, 1500
@@ -325,8 +325,10 @@ def _viewer_data(content: ReportContent) -> dict | None:
     for eye in content.eyes:
         wet[eye.vertices] = True
     return {
-        "mesh": packed(small, vertex_normals(content.mesh.vertices, content.mesh.faces), wet),
+        "mesh": packed(small, vertex_normals(content.mesh.vertices, content.mesh.faces), wet,
+                       content.actions),
         "wet": WET,
+        "action_step": ACTION_STEP_MM,
         "albedo": jpeg_uri(srgb_bytes(shrunk(content.maps["diffuse_albedo"], VIEWER_TEXTURE_PIXELS))),
         "harmonics": np.round(irradiance_harmonics(content.envmap), 6).tolist(),
         "roughness": 0.4 if roughness is None else round(float(np.median(roughness)), 4),

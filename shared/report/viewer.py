@@ -1,4 +1,5 @@
-"""The mesh for the page's 3D view: reduced, quantised and packed into base64 text; light as order-2 harmonics.
+"""The mesh for the page's 3D view: reduced, quantised and packed into base64 text; light as order-2 harmonics; some of
+the facial actions.
 
 Reference: [Ramamoorthi2001] (irradiance by nine harmonics).
 """
@@ -6,14 +7,21 @@ Reference: [Ramamoorthi2001] (irradiance by nine harmonics).
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 
 import numpy as np
 
+from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.mesh import Mesh
 
 FACE_LIMIT = 40_000
 """About 700 kB on the page; the eye sees no difference at its size."""
 
+
+SHOWN_ACTIONS = ("eyeBlinkLeft", "eyeBlinkRight", "browInnerUp", "browDownLeft", "jawOpen", "mouthSmileLeft",
+                 "mouthSmileRight", "mouthPucker")
+ACTION_STEP_MM, LEAST_STEPS = 0.01, 5
+"""Offsets are written as multiples of it; where they stay below so many the vertex does not move."""
 
 WET = (0.2, 0.63)
 """Roughness and specular intensity of eyes: the view's lamp has no extent, so they stand for a tear film under a small
@@ -49,12 +57,16 @@ def reduced(mesh: Mesh, face_limit: int = FACE_LIMIT) -> Mesh | None:
     return current
 
 
-def packed(mesh: Mesh, normals: np.ndarray, wet: np.ndarray | None = None) -> dict:
+def packed(
+    mesh: Mesh, normals: np.ndarray, wet: np.ndarray | None = None, actions: Sequence[BlendShape] = ()
+) -> dict:
     """For viewer.js: one vertex per distinct corner, positions and UVs as uint16, normals as int8, base64.
 
     normals [V, 3], such as those of the mesh before it was reduced; wet [V] bool: vertices of the eyes, whose normals
-    have a fourth component of 127, else 0. -> {"count", "positions", "normals", "uvs", "faces", "low" [3], "size" [3]};
-    position = low + size * q / 65535 mm.
+    have a fourth component of 127, else 0. actions: of the mesh, of which those of SHOWN_ACTIONS are packed.
+    -> {"count", "positions", "normals", "uvs", "faces", "low" [3], "size" [3], "actions"};
+    position = low + size * q / 65535 mm. An action is {"name", "vertices", "offsets", "half"}: int16 in steps of
+    ACTION_STEP_MM; "half" at weight 0.5, "" where the way is straight.
     """
     uv_codes = np.round(np.clip(mesh.uvs, 0.0, 1.0) * 65535).astype(np.int64)
     keys = np.column_stack([mesh.faces.ravel(), uv_codes[mesh.face_uvs.ravel()]])
@@ -75,7 +87,21 @@ def packed(mesh: Mesh, normals: np.ndarray, wet: np.ndarray | None = None) -> di
         "faces": _text(index.ravel().astype("<u4")),
         "low": [round(float(value), 4) for value in low],
         "size": [round(float(value), 4) for value in size],
+        "actions": [_packed_action(shape, used) for shape in actions if shape.name in SHOWN_ACTIONS],
     }
+
+
+def _packed_action(shape: BlendShape, used: np.ndarray) -> dict:
+    """used [n]: vertex of each packed one."""
+    between = dict(shape.between).get(0.5)
+    moves = np.stack([shape.offsets, shape.offsets if between is None else between])
+    steps = np.round(moves / ACTION_STEP_MM).clip(-32767, 32767).astype("<i2")
+    row = np.full(max(used.max(), shape.vertices.max()) + 1, -1)
+    row[shape.vertices] = np.where(np.abs(steps).max((0, 2)) >= LEAST_STEPS, np.arange(len(shape.vertices)), -1)
+    corners = np.nonzero(row[used] >= 0)[0]
+    full, half = steps[:, row[used[corners]]]
+    return {"name": shape.name, "vertices": _text(corners.astype("<u4")), "offsets": _text(full),
+            "half": "" if between is None else _text(half)}
 
 
 def _text(array: np.ndarray) -> str:

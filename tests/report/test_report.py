@@ -11,6 +11,7 @@ from browser import DESKTOP, PHONE, needs_browser, visit
 from shapes import sphere
 from toy_result import FRAMES, ToyJob, toy_poses, write_toy_work
 
+from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.mesh import subdivide, vertex_normals
 from shared.geometry.transforms import rigid, rotation_from_vector
 from shared.report.advice import advice
@@ -18,7 +19,7 @@ from shared.report.charts import line_chart, nice_ticks
 from shared.report.content import chosen_frames, excluded_frames, motion, number, warnings_of
 from shared.report.page import flat
 from shared.report.pictures import ERROR_RANGE, error_bytes, grey_bytes, shrunk, srgb_bytes, viridis_bytes
-from shared.report.viewer import coarser, irradiance_harmonics, packed, reduced
+from shared.report.viewer import ACTION_STEP_MM, coarser, irradiance_harmonics, packed, reduced
 from stages import export_usd
 
 NAME = '<script>alert("é")</script> & co'
@@ -328,6 +329,29 @@ def test_packed_mesh_unpacks():
     np.testing.assert_allclose(unpack("uvs", "<u2", 2)[index] / 65535, mesh.uvs[mesh.face_uvs], atol=1e-4)
     normals = unpack("normals", np.int8, 4)[index][..., :3] / 127
     np.testing.assert_allclose(normals, mesh.vertices[mesh.faces] / 80.0, atol=0.03)
+
+
+def test_packed_actions_move_every_corner_of_their_vertices():
+    """Those that the page shows, in hundredths of a millimetre; the half-way shape only where there is one."""
+    mesh = sphere(80.0, 2)
+    moves = np.zeros((2, *mesh.vertices.shape))
+    moves[:, 3:30] = np.random.default_rng(1).normal(0.0, 6.0, (2, 27, 3))
+    moves[:, 40:50] = 0.02
+    shapes = [BlendShape.of("jawOpen", moves[0], 0.0), BlendShape.of("tongueOut", moves[0], 0.0),
+              BlendShape.of("eyeBlinkLeft", moves[0], 0.0, ((0.5, moves[1]),))]
+    data = packed(mesh, vertex_normals(mesh.vertices, mesh.faces), actions=shapes)
+    jaw, blink = data["actions"]
+    assert (jaw["name"], blink["name"], jaw["half"]) == ("jawOpen", "eyeBlinkLeft", "")
+
+    def unpack(text, kind, width):
+        return np.frombuffer(base64.b64decode(text), kind).reshape(-1, width)
+
+    index = unpack(data["faces"], "<u4", 1)[:, 0]
+    for action, key, expected in ((jaw, "offsets", moves[0]), (blink, "offsets", moves[0]), (blink, "half", moves[1])):
+        found = np.zeros((index.max() + 1, 3))
+        found[unpack(action["vertices"], "<u4", 1)[:, 0]] = ACTION_STEP_MM * unpack(action[key], "<i2", 3)
+        expected = np.where(np.arange(len(expected))[:, None] < 40, expected, 0.0)
+        np.testing.assert_allclose(found[index], expected[mesh.faces.ravel()], atol=0.5 * ACTION_STEP_MM + 1e-6)
 
 
 def test_harmonics_give_the_irradiance_of_a_known_sky():

@@ -69,6 +69,12 @@ def test_run_record_says_which_there_are(exported):
     assert sorted([*said["names"], *said["lacking"]]) == sorted(ARKIT_NAMES) and said["note"] == ""
 
 
+def test_the_page_plays_some_of_them(exported):
+    pages = {on: (job.out / "report.html").read_text(encoding="utf-8") for on, job in exported.items()}
+    assert "<option>jawOpen</option>" in pages[True] and 'id="viewer-weight"' in pages[True]
+    assert 'id="viewer-weight"' not in pages[False]
+
+
 def test_a_mesh_from_elsewhere_has_none_and_it_is_said(tmp_path):
     job = ToyJob(write_toy_work(tmp_path / "work", eyes=True), tmp_path / "export", views=False, plates=False)
     export_usd.run(job)

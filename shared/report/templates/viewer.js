@@ -1,6 +1,6 @@
 "use strict";
 // The 3D view: the head under the light of the clip (order-2 harmonics) and one lamp that can be moved.
-// Drag turns the head, or moves the lamp when that is chosen; wheel or pinch zooms.
+// Drag turns the head, or moves the lamp when that is chosen; wheel or pinch zooms. Facial actions: one at a time.
 function startViewer(canvas, data) {
   const gl = data && canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
   if (!gl) {
@@ -55,15 +55,17 @@ function startViewer(canvas, data) {
   const uniform = (name) => gl.getUniformLocation(program, name);
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   function attribute(name, text, size, type, normalised, stride) {
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    const buffer = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
     gl.bufferData(gl.ARRAY_BUFFER, bytes(text), gl.STATIC_DRAW);
     const place = gl.getAttribLocation(program, name);
     gl.enableVertexAttribArray(place);
     gl.vertexAttribPointer(place, size, type, normalised, stride, 0);
+    return buffer;
   }
   const mesh = data.mesh, scale = 2 / Math.max(...mesh.size);
-  attribute("position", mesh.positions, 3, gl.UNSIGNED_SHORT, true, 8);
-  attribute("normal", mesh.normals, 4, gl.BYTE, true, 4);
+  const positions = attribute("position", mesh.positions, 3, gl.UNSIGNED_SHORT, true, 8);
+  const normals = attribute("normal", mesh.normals, 4, gl.BYTE, true, 4);
   attribute("uv", mesh.uvs, 2, gl.UNSIGNED_SHORT, true, 4);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, bytes(mesh.faces), gl.STATIC_DRAW);
@@ -100,6 +102,51 @@ function startViewer(canvas, data) {
     gl.drawElements(gl.TRIANGLES, mesh.count, gl.UNSIGNED_INT, 0);
     canvas.dataset.drawn = "yes";
   }
+  const update = (buffer, values) => {
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+    gl.bufferData(gl.ARRAY_BUFFER, values, gl.DYNAMIC_DRAW);
+  };
+  const faces = new Uint32Array(bytes(mesh.faces).buffer);
+  function faceNormals(q) {  // sums of the faces' normals at each vertex, of unit length
+    const step = mesh.size.map((x) => x / 65535), n = new Float32Array(q.length / 4 * 3);
+    for (let f = 0; f < faces.length; f += 3) {
+      const [a, b, c] = [faces[f], faces[f + 1], faces[f + 2]];
+      const [u, v] = [b, c].map((k) => step.map((s, i) => s * (q[4 * k + i] - q[4 * a + i])));
+      for (let i = 0; i < 3; i++) {
+        const [j, l] = [(i + 1) % 3, (i + 2) % 3], x = u[j] * v[l] - u[l] * v[j];
+        n[3 * a + i] += x; n[3 * b + i] += x; n[3 * c + i] += x;
+      }
+    }
+    for (let k = 0; k < n.length; k += 3) {
+      const length = Math.hypot(n[k], n[k + 1], n[k + 2]) || 1;
+      for (let i = 0; i < 3; i++) n[k + i] /= length;
+    }
+    return n;
+  }
+  function act() {
+    const action = mesh.actions[control("viewer-action").selectedIndex], w = +control("viewer-weight").value;
+    const q = new Uint16Array(bytes(mesh.positions).buffer), n = new Int8Array(bytes(mesh.normals).buffer);
+    const before = faceNormals(q), which = new Uint32Array(bytes(action.vertices).buffer);
+    const [full, half] = [action.offsets, action.half].map((text) => new Int16Array(bytes(text).buffer));
+    const [share, bend] = half.length ? [Math.max(0, 2 * w - 1), 1 - Math.abs(2 * w - 1)] : [w, 0];
+    which.forEach((k, row) => {
+      for (let i = 0; i < 3; i++) {
+        const moved = data.action_step * (share * full[3 * row + i] + (bend ? bend * half[3 * row + i] : 0));
+        q[4 * k + i] = Math.max(0, Math.min(65535, Math.round(q[4 * k + i] + moved / mesh.size[i] * 65535)));
+      }
+    });
+    const after = faceNormals(q);
+    for (let k = 0; 4 * k < n.length; k++) {
+      const turned = [0, 1, 2].map((i) => n[4 * k + i] + 127 * (after[3 * k + i] - before[3 * k + i]));
+      const length = Math.hypot(...turned) || 1;
+      turned.forEach((x, i) => { n[4 * k + i] = Math.round(127 * x / length); });
+    }
+    update(positions, q);
+    update(normals, n);
+    canvas.dataset.action = action.name + " " + w;
+    draw();
+  }
+  for (const id of ["viewer-action", "viewer-weight"]) control(id)?.addEventListener("input", act);
   const image = new Image();
   image.onload = () => {
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
