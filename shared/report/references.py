@@ -36,6 +36,8 @@ REFERENCES = {
         "Duff et al., Building an Orthonormal Basis, Revisited. Journal of Computer Graphics Techniques 6, 2017.",
     "Dupuy2023": "Dupuy, Benyoub, Sampling Visible GGX Normals with Spherical Caps. Computer Graphics Forum 42, 2023.",
     "Fry1962": "Fry, Hill, The Center of Rotation of the Eye. American Journal of Optometry 39, 1962.",
+    "Garland1998": "Garland, Heckbert, Simplifying Surfaces with Color and Texture using Quadric Error Metrics. IEEE "
+                   "Visualization 1998.",
     "Geman1985":
         "Geman, McClure, Bayesian Image Analysis: An Application to Single Photon Emission Tomography. American "
         "Statistical Association, 1985.",
@@ -46,6 +48,8 @@ REFERENCES = {
     "Harris2020": "Harris et al., Array programming with NumPy. Nature 585, 2020.",
     "He2010": "He, Sun, Tang, Guided Image Filtering. ECCV 2010.",
     "He2015": "He, Sun, Fast Guided Filter. arXiv 1505.00996, 2015.",
+    "Hoppe1999": "Hoppe, New Quadric Metric for Simplifying Meshes with Appearance Attributes. IEEE Visualization "
+                 "1999.",
     "Horn1975": "Horn, Obtaining Shape from Shading Information. The Psychology of Computer Vision, McGraw-Hill 1975.",
     "Immerkaer1996": "Immerkaer, Fast Noise Variance Estimation. Computer Vision and Image Understanding 64, 1996.",
     "Jakob2022": "Jakob et al., Mitsuba 3 renderer. 2022.",
