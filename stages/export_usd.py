@@ -25,7 +25,7 @@ from shared.errors import LimnError
 
 STAGE = Stage(
     name="export_usd",
-    version=8,
+    version=9,
     help="The head as USD, glTF, OBJ and EXR, with a report to judge it by.",
     inputs=("sample_frames", "track_landmarks", "init_albedo", "inverse_render"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -33,8 +33,8 @@ STAGE = Stage(
     outputs=(
         Output("head.usda", "light, camera and motion; loads the next three", unit="mm", space="world"),
         Output("head_payload.usda", "payload of head.usda: joins the next two"),
-        Output("head_geo.usdc", "the mesh and its blend shapes; head and eyes where the gaze is known", unit="mm",
-               space="head"),
+        Output("head_geo.usdc", "the mesh and its blend shapes, in full and reduced; head and eyes where the gaze is "
+               "known", unit="mm", space="head"),
         Output("head_mtl.usda", "the materials"),
         Output("head.usdz", "all of head.usda and its textures in one file; absent when usdz is off", optional=True),
         Output("head.glb", "mesh, morph targets, textures, lens and motion as binary glTF; absent when glb is off",
@@ -68,12 +68,16 @@ STAGE = Stage(
         Parameter("usdz", bool, True, "Also pack everything into head.usdz."),
         Parameter("glb", bool, True, "Also write binary glTF."),
         Parameter("actions", bool, True, "Also write facial actions as blend shapes, if the mesh is the head model's."),
+        Parameter("detail", bool, True, "Also write meshes of 20,000 and 5,000 faces, as variants of the asset."),
         Parameter("plates", bool, True, "Also write the clip's frames, shown behind the head in USD as a guide."),
         Parameter("views", bool, True, "Also render the head from the side and under other lights."),
         Parameter("view_size", int, 512, "Edge of those pictures.", "px", 64, 4096),
         Parameter("report_frames", int, 12, "Frames that the report compares.", unit="frames", minimum=1, maximum=60),
     ),
 )
+
+PAGE_DETAIL = "20k"
+"""What the report's 3D view shows; nobody sees a difference at its size."""
 
 
 def read_maps(folder: Path) -> dict:
@@ -89,32 +93,28 @@ def read_maps(folder: Path) -> dict:
     return maps | {"specular_ior": modulated_ior(maps["specular_intensity"])}
 
 
-def read_eyeballs(job: Job, mesh) -> tuple:
-    """The right and the left Eyeball of the mesh, which are groups of mesh.obj and, where their gaze is known, meshes
-    of their own in the asset; none where the mesh has no eyes."""
-    from shared.geometry.eyeballs import eyeballs_of
+def read_surface(job: Job, mesh):
+    """The mesh with its segments, where it has any."""
     from shared.geometry.surface import Surface
     from shared.io.arrays import load_arrays, read_json
 
     segment = load_arrays(job.input("inverse_render") / "mesh.npz").get("face_segment")
     if segment is None:
-        return ()
-    names = read_json(job.input("track_landmarks") / "tracking.json")["segments"]
-    return eyeballs_of(Surface(mesh, segment, tuple(names))) or ()
+        return Surface(mesh)
+    return Surface(mesh, segment, tuple(read_json(job.input("track_landmarks") / "tracking.json")["segments"]))
 
 
-def find_actions(job: Job, mesh) -> tuple[tuple, dict]:
+def find_actions(job: Job, surface) -> tuple[tuple, dict]:
     """The facial actions as blend shapes of the mesh, and what run.json says of them; nothing when switched off."""
     from shared.actions.facial import facial_actions
     from shared.actions.names import lacking_names
-    from shared.io.arrays import load_arrays
     from shared.tracking.models import load_head_model
 
     if not job.params.actions:
         return (), {}
     shapes = ()
-    if "face_segment" in load_arrays(job.input("inverse_render") / "mesh.npz"):
-        shapes = facial_actions(load_head_model(), mesh.vertices, mesh.faces)
+    if surface.face_segment is not None:
+        shapes = facial_actions(load_head_model(), surface.mesh.vertices, surface.mesh.faces)
     names = [shape.name for shape in shapes]
     note = "" if names else "the mesh is not the head model's: it has no facial actions"
     return shapes, {"names": names, "lacking": lacking_names(tuple(names)), "note": note}
@@ -161,9 +161,9 @@ def near_lamp(solve: dict):
     return BallLamp(tuple(lamp["position_mm"]), lamp["radius_mm"], tuple(lamp["radiance"]))
 
 
-def describe_asset(job: Job, mesh, eyes, actions, capture, frames, writer, lamp):
-    """The asset that head.usda and head.usdz hold; writes the plates. actions: its blend shapes; lamp: what stands near
-    of the light, or None."""
+def describe_asset(job: Job, mesh, eyes, actions, details, capture, frames, writer, lamp):
+    """The asset that head.usda and head.usdz hold; writes the plates. actions: its blend shapes; details: {variant: the
+    mesh with fewer faces}; lamp: what stands near of the light, or None."""
     from shared.io.plates import crop_rectangle, write_plates
     from shared.io.usd import HeadAsset
     from shared.io.usd_capture import Plate
@@ -184,7 +184,7 @@ def describe_asset(job: Job, mesh, eyes, actions, capture, frames, writer, lamp)
         "confidence_map": f"maps/{writer.file_name('confidence')}",
     }
     light = TextureFile("./envmap.exr" if lamp is None else "./envmap_far.exr", writer.colour_space)
-    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, lamp, eyes, actions,
+    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, lamp, eyes, actions, details,
                      version=str(STAGE.version), metadata=metadata)
 
 
@@ -324,11 +324,15 @@ def method_records(job: Job, record: dict, solve: dict):
 def run(job: Job) -> None:
     """Writes the result's files, then the report about them."""
     from shared.compute.processor import use_baseline_opencv
+    from shared.geometry.eyeballs import eyeballs_of
+    from shared.geometry.mesh import shading_normals
+    from shared.geometry.reduction import reduced
     from shared.io.arrays import load_arrays, read_json, write_json
     from shared.io.export_maps import MapWriter
     from shared.io.frames import FrameSet
     from shared.io.images import read_exr
     from shared.io.meshes import load_mesh
+    from shared.io.usd_detail import REDUCED_FACES
     from shared.report.content import ReportInputs, result_content
     from shared.report.methods import methods_paragraphs, methods_text
     from shared.report.page import report_html
@@ -348,10 +352,13 @@ def run(job: Job) -> None:
     if lamp is not None:
         far = read_exr(solved / "envmap_far.exr")
         writer.write_colour(job.out / "envmap_far.exr", far, "radiance, clip maximum 1", latlong=True)
-    eyeballs = read_eyeballs(job, mesh)
+    surface = read_surface(job, mesh)
+    eyeballs = eyeballs_of(surface) or ()
     eyes = eyeballs if "eye_turn" in poses else ()
-    actions, said_of_them = find_actions(job, mesh)
-    asset = describe_asset(job, mesh, eyes, actions, describe_capture(job, poses, frames), frames, writer, lamp)
+    actions, said_of_them = find_actions(job, surface)
+    details = dict(zip(REDUCED_FACES, reduced(surface, tuple(REDUCED_FACES.values())), strict=True))
+    asset = describe_asset(job, mesh, eyes, actions, details if params.detail else {},
+                           describe_capture(job, poses, frames), frames, writer, lamp)
     write_assets(job, asset, eyeballs, poses, maps, far)
     views = render_views(job, writer, mesh, eyes, maps, envmap, poses, frames, solve)
     record = run_record(job, mesh, said_of_them, solve, time.perf_counter() - start)
@@ -360,8 +367,8 @@ def run(job: Job) -> None:
     (job.out / "methods.txt").write_text(methods_text(methods), encoding="utf-8")
     folders = {name: job.input(name) for name in STAGE.inputs}
     files = [(output.path, output.help) for output in STAGE.outputs]
-    result = ReportInputs(job.subject.name, folders, frames, mesh, poses, maps, envmap, solve, record, files, views,
-                          clips, methods_paragraphs(methods), eyes, actions)
+    result = ReportInputs(job.subject.name, folders, frames, details[PAGE_DETAIL].mesh, shading_normals(mesh), poses,
+                          maps, envmap, solve, record, files, views, clips, methods_paragraphs(methods), eyes, actions)
     page = report_html(result_content(result, job.params.report_frames))
     (job.out / "report.html").write_text(page, encoding="utf-8")
 

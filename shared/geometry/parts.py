@@ -26,19 +26,23 @@ class RigidPart:
     vertices: np.ndarray
 
 
-def head_parts(mesh: Mesh, eyes: Sequence[Eyeball] = ()) -> tuple[RigidPart, ...]:
+def head_parts(
+    mesh: Mesh, eyes: Sequence[Eyeball] = (), normals: np.ndarray | None = None
+) -> tuple[RigidPart, ...]:
     """The head, then the right and the left eyeball, which turn about their centres; the head alone without eyes.
 
-    All share the atlas: UVs stay where they are. Faces keep their order within a part.
+    All share the atlas: UVs stay where they are. Faces keep their order within a part. normals [V, 3]: of a mesh that
+    this one was reduced from, with vertices that it does not use and no part has; None: its own.
     """
-    normals = shading_normals(mesh)
-    if not eyes:
-        return (RigidPart(HEAD, mesh, normals, np.zeros(3), np.arange(len(mesh.vertices))),)
+    if normals is None:
+        normals = shading_normals(mesh)
+        if not eyes:
+            return (RigidPart(HEAD, mesh, normals, np.zeros(3), np.arange(len(mesh.vertices))),)
     rest = np.ones(len(mesh.faces), bool)
     for eye in eyes:
         rest[eye.faces] = False
     whole = [(HEAD, np.nonzero(rest)[0], np.zeros(3))]
-    whole += [(name, np.sort(eye.faces), eye.centre) for name, eye in zip(EYES, eyes, strict=True)]
+    whole += [(name, np.sort(eye.faces), eye.centre) for name, eye in zip(EYES if eyes else (), eyes, strict=True)]
     return tuple(_part(mesh, normals, *each) for each in whole)
 
 

@@ -2,6 +2,6 @@
 
 Read in this order: arrays, orientation, pixel_format, colour_tags, source, exr_header, images, image_tags,
 exr_picture, image_sequence, video, frames, plates, meshes, export_maps, usd_material, usd_capture, usd_actions,
-usd, usd_validate, usdz, gltf, gltf_validate, exr_checks, export_checks.
+usd_detail, usd, usd_validate, usdz, gltf, gltf_validate, exr_checks, export_checks.
 May import: errors, geometry, imaging.
 """

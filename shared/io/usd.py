@@ -10,6 +10,8 @@
       mtl/skin          Material: UsdPreviewSurface and OpenPBR; mtl/eye likewise
       capture           camera, lights and the clip's card, in the variant "clip" of the variant set "capture"
 
+    What a mesh is made of lies in the variants of the set "detail" (usd_detail).
+
 The variant "clip" (the default) replays the capture: the head's (or the camera's) motion and the eyes' gaze as time
 samples, the light at rest, the clip on a card of purpose guide. The variant "still" leaves the head alone at head
 space's origin, for use in another scene. There, and at the default time of "clip", the eyes look straight ahead.
@@ -35,9 +37,10 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 from shared.errors import LimnError
 from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.eyeballs import Eyeball
-from shared.geometry.mesh import Mesh
-from shared.geometry.parts import EYES, HEAD, head_parts
-from shared.io.usd_actions import define_actions
+from shared.geometry.mesh import Mesh, shading_normals
+from shared.geometry.parts import EYES, HEAD, RigidPart, head_parts
+from shared.geometry.reduction import ReducedMesh
+from shared.io.usd_actions import bind_actions, define_skeleton
 from shared.io.usd_capture import (
     BallLamp,
     Plate,
@@ -51,6 +54,7 @@ from shared.io.usd_capture import (
     turn,
     world_from_head_rigid,
 )
+from shared.io.usd_detail import FULL, define_details, each_detail
 from shared.io.usd_material import EYE, EYE_MAPS, TextureFile, define_material
 
 METERS_PER_UNIT = 0.001
@@ -64,8 +68,9 @@ class HeadAsset:
 
     maps: {name of usd_material.SHADER_INPUTS: texture}; envmap: the dome light's texture; lamp: what stands near of the
     light and is not in that texture, or None; plate: the clip's frames, or None; eyes: the right and the left eyeball
-    of the mesh, to be meshes of their own, or none; actions: blend shapes of the mesh, which move no eyeball; metadata:
-    nested dictionaries of strings, numbers and lists for the root prim's customData["limn"].
+    of the mesh, to be meshes of their own, or none; actions: blend shapes of the mesh, which move no eyeball; details:
+    {variant: the mesh with fewer faces}; metadata: nested dictionaries of strings, numbers and lists for the root
+    prim's customData["limn"].
     """
 
     name: str
@@ -77,6 +82,7 @@ class HeadAsset:
     lamp: BallLamp | None = None
     eyes: Sequence[Eyeball] = ()
     actions: Sequence[BlendShape] = ()
+    details: Mapping[str, ReducedMesh] = field(default_factory=dict)
     version: str = "1"
     metadata: Mapping[str, object] = field(default_factory=dict)
 
@@ -152,15 +158,26 @@ def _define_geometry(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None
     geo = root.AppendChild("geo")
     kind = UsdSkel.Root if asset.actions else UsdGeom.Xform if asset.eyes else UsdGeom.Scope
     kind.Define(stage, geo)
-    for part in head_parts(asset.mesh, asset.eyes):
-        prim = define_mesh(stage, str(geo.AppendChild(part.name)), part.mesh, part.normals)
+    skeleton = define_skeleton(stage, geo, asset.actions) if asset.actions else None
+    full = head_parts(asset.mesh, asset.eyes)
+    for part in full:
+        prim = UsdGeom.Mesh.Define(stage, geo.AppendChild(part.name))
         if part.name in EYES:
             prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*map(float, part.pivot)))
             # The variants give its value: one that stood here would be stronger than theirs in a single layer.
             prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
-        elif asset.actions:
-            count = len(asset.mesh.vertices)
-            define_actions(stage, geo, prim, [shape.of_part(part.vertices, count) for shape in asset.actions])
+    for detail in each_detail(stage.GetPrimAtPath(root), asset.details):
+        for part in full if detail == FULL else _reduced_parts(asset, detail):
+            prim = define_mesh(stage, str(geo.AppendChild(part.name)), part.mesh, part.normals)
+            if part.name == HEAD and skeleton:
+                count = len(asset.mesh.vertices)
+                bind_actions(prim, skeleton, [shape.of_part(part.vertices, count) for shape in asset.actions])
+
+
+def _reduced_parts(asset: HeadAsset, detail: str) -> tuple[RigidPart, ...]:
+    """With the normals of the full mesh: few faces have worse ones, and the normal map bends those."""
+    few = asset.details[detail]
+    return head_parts(few.mesh, [few.eyeball(eye) for eye in asset.eyes], shading_normals(asset.mesh))
 
 
 def _define_materials(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None:
@@ -189,9 +206,11 @@ def _define_interface(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> Non
     stage.SetFramesPerSecond(asset.capture.fps)
     stage.GetRootLayer().documentation = (
         "A head recovered from a clip by Limn. Lengths in millimetres; time codes are frames of the clip. "
-        "Variant set 'capture': 'clip' replays the clip with its camera and light, 'still' is the head alone."
+        "Variant set 'capture': 'clip' replays the clip with its camera and light, 'still' is the head alone. "
+        "Variant set 'detail': 'full', or about as many triangles as the name says."
     )
     prim = stage.GetPrimAtPath(root)
+    define_details(prim, asset.details)
     model = Usd.ModelAPI(prim)
     model.SetKind(Kind.Tokens.component)
     model.SetAssetName(root.name)

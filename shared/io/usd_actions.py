@@ -25,17 +25,9 @@ SKELETON, ANIMATION, JOINT = "skeleton", "actions", "head"
 HALF_WEIGHT, HALF_NAME = 0.5, "half"
 
 
-def define_actions(stage: Usd.Stage, root: Sdf.Path, mesh: UsdGeom.Mesh, shapes: Sequence[BlendShape]) -> None:
-    """Binds the shapes to the mesh below the SkelRoot at root; their vertices are those of the mesh."""
-    skeleton = _define_skeleton(stage, root.AppendChild(SKELETON), [shape.name for shape in shapes])
-    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
-    binding.CreateSkeletonRel().SetTargets([skeleton])
-    binding.CreateBlendShapesAttr([shape.name for shape in shapes])
-    paths = [_define_shape(stage, mesh.GetPath().AppendChild(shape.name), shape) for shape in shapes]
-    binding.CreateBlendShapeTargetsRel().SetTargets(paths)
-
-
-def _define_skeleton(stage: Usd.Stage, path: Sdf.Path, names: list[str]) -> Sdf.Path:
+def define_skeleton(stage: Usd.Stage, root: Sdf.Path, shapes: Sequence[BlendShape]) -> Sdf.Path:
+    """The skeleton below the SkelRoot at root, and the weights of the shapes -> its path."""
+    path, names = root.AppendChild(SKELETON), [shape.name for shape in shapes]
     skeleton = UsdSkel.Skeleton.Define(stage, path)
     rest = Vt.Matrix4dArray([Gf.Matrix4d(1.0)])
     skeleton.CreateJointsAttr([JOINT])
@@ -46,6 +38,16 @@ def _define_skeleton(stage: Usd.Stage, path: Sdf.Path, names: list[str]) -> Sdf.
     animation.CreateBlendShapeWeightsAttr(Vt.FloatArray(len(names), 0.0))
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
     return path
+
+
+def bind_actions(mesh: UsdGeom.Mesh, skeleton: Sdf.Path, shapes: Sequence[BlendShape]) -> None:
+    """Binds the shapes to the mesh, whose vertices are theirs, and both to the skeleton."""
+    stage = mesh.GetPrim().GetStage()
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([skeleton])
+    binding.CreateBlendShapesAttr([shape.name for shape in shapes])
+    paths = [_define_shape(stage, mesh.GetPath().AppendChild(shape.name), shape) for shape in shapes]
+    binding.CreateBlendShapeTargetsRel().SetTargets(paths)
 
 
 def _define_shape(stage: Usd.Stage, path: Sdf.Path, shape: BlendShape) -> Sdf.Path:

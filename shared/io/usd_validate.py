@@ -37,10 +37,31 @@ _USD_TYPES = {
 
 
 def usd_errors(path: Path | str) -> list[str]:
-    """Sentences about everything wrong with the asset at path (.usda or .usdz); empty when it is sound."""
+    """Sentences about everything wrong with the asset at path (.usda or .usdz), as it opens and in each other variant;
+    empty when it is sound."""
     stage = Usd.Stage.Open(str(path))
     if stage is None or not stage.GetDefaultPrim():
         return [f"{Path(path).name}: not a USD stage with a default prim"]
+    errors = _stage_errors(stage)
+    root = stage.GetDefaultPrim()
+    for name in root.GetVariantSets().GetNames():
+        variants = root.GetVariantSet(name)
+        chosen = variants.GetVariantSelection()
+        for other in variants.GetVariantNames():
+            if other != chosen:
+                _choose(stage, name, other)
+                errors += [f"{name}={other}: {error}" for error in _stage_errors(stage) if error not in errors]
+        _choose(stage, name, chosen)
+    return [f"{Path(path).name}: {error}" for error in errors]
+
+
+def _choose(stage: Usd.Stage, name: str, variant: str) -> None:
+    """For this stage alone: nothing is written to its layers."""
+    with Usd.EditContext(stage, stage.GetSessionLayer()):
+        stage.GetDefaultPrim().GetVariantSet(name).SetVariantSelection(variant)
+
+
+def _stage_errors(stage: Usd.Stage) -> list[str]:
     errors = _validator_errors(stage)
     for prim in stage.Traverse():
         if prim.IsA(UsdGeom.Mesh) and UsdGeom.Imageable(prim).ComputePurpose() != UsdGeom.Tokens.guide:
@@ -48,7 +69,7 @@ def usd_errors(path: Path | str) -> list[str]:
         elif prim.IsA(UsdShade.Shader):
             errors += _shader_errors(UsdShade.Shader(prim))
         errors += _path_errors(prim)
-    return [f"{Path(path).name}: {error}" for error in errors]
+    return errors
 
 
 def package_errors(path: Path | str) -> list[str]:

@@ -72,7 +72,8 @@ class ClipContent:
 class ReportContent:
     """One subject's result.
 
-    facts, numbers, files: (label, value) pairs. maps {name: [S, S] or [S, S, 3]}, envmap [H, W, 3] linear.
+    facts, numbers, files: (label, value) pairs. maps {name: [S, S] or [S, S, 3]}, envmap [H, W, 3] linear. mesh: as the
+    3D view shows it, with few faces; normals [V, 3] of its vertices.
     angles_deg [F, 3] yaw, pitch, roll and position_mm [F, 3] at frame_index [F]. excluded: (frame, stage, reason).
     views: None when they were not wished; relit_eyes: where its relit pictures show both eyes, as Frame.eyes. eyes,
     actions: of the mesh, or none. selection: the models tried, one dictionary each, in order. residuals: nested
@@ -87,6 +88,7 @@ class ReportContent:
     maps: Mapping[str, np.ndarray]
     envmap: np.ndarray
     mesh: Mesh
+    normals: np.ndarray
     frame_index: np.ndarray
     angles_deg: np.ndarray
     position_mm: np.ndarray
@@ -128,15 +130,17 @@ class ClipResult:
 class ReportInputs:
     """What the export holds in memory while it writes: the report's raw material.
 
-    folders {stage: folder} of the stages before it; record: the content of run.json; files: (name, text) pairs; views:
-    None when they were not wished; clips: all but the first, where there are several; methods: paragraphs, references;
-    eyes: the right and the left eyeball of the mesh, where poses say how they look, or none; actions: its blend shapes.
+    folders {stage: folder} of the stages before it; mesh: the head with few faces, normals [V, 3]: those of its
+    vertices in the whole one; record: the content of run.json; files: (name, text) pairs; views: None when they were
+    not wished; clips: all but the first, where there are several; methods: paragraphs, references; eyes: the right and
+    the left eyeball of the whole mesh, where poses say how they look, or none; actions: its blend shapes.
     """
 
     name: str
     folders: Mapping[str, Path]
     frames: FrameSet
     mesh: Mesh
+    normals: np.ndarray
     poses: Mapping[str, np.ndarray]
     maps: Mapping[str, np.ndarray]
     envmap: np.ndarray
@@ -173,6 +177,7 @@ def result_content(result: ReportInputs, frame_count: int) -> ReportContent:
         eyes=result.eyes,
         actions=result.actions,
         mesh=result.mesh,
+        normals=result.normals,
         frame_index=poses["frame_index"],
         angles_deg=angles,
         position_mm=position,

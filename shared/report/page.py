@@ -13,7 +13,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from shared.geometry.mesh import vertex_normals
 from shared.rendering.studio_lights import STUDIO_LIGHTS
 from shared.rendering.view_set import NOVEL_VIEWS, ViewSet
 from shared.report.advice import advice
@@ -30,7 +29,7 @@ from shared.report.pictures import (
     viridis_bytes,
 )
 from shared.report.template import filled
-from shared.report.viewer import ACTION_STEP_MM, WET, irradiance_harmonics, packed, reduced
+from shared.report.viewer import ACTION_STEP_MM, WET, irradiance_harmonics, packed
 
 TEMPLATES = Path(__file__).with_name("templates")
 FRAME_PIXELS, MAP_PIXELS, LIGHT_PIXELS, OVERLAY_PIXELS = 440, 1024, 768, 1500
@@ -315,18 +314,13 @@ def flat(values: Mapping[str, object], prefix: str = "") -> list[tuple[str, obje
     return rows
 
 
-def _viewer_data(content: ReportContent) -> dict | None:
-    """None when the mesh cannot be made small enough for a page."""
-    small = reduced(content.mesh)
-    if small is None:
-        return None
+def _viewer_data(content: ReportContent) -> dict:
     roughness, specular = content.maps.get("roughness"), content.maps.get("specular_intensity")
     wet = np.zeros(len(content.mesh.vertices), bool)
     for eye in content.eyes:
         wet[eye.vertices] = True
     return {
-        "mesh": packed(small, vertex_normals(content.mesh.vertices, content.mesh.faces), wet,
-                       content.actions),
+        "mesh": packed(content.mesh, content.normals, wet, content.actions),
         "wet": WET,
         "action_step": ACTION_STEP_MM,
         "albedo": jpeg_uri(srgb_bytes(shrunk(content.maps["diffuse_albedo"], VIEWER_TEXTURE_PIXELS))),

@@ -1,5 +1,5 @@
-"""The mesh for the page's 3D view: reduced, quantised and packed into base64 text; light as order-2 harmonics; some of
-the facial actions.
+"""The mesh for the page's 3D view: quantised and packed into base64 text; light as order-2 harmonics; some of the
+facial actions.
 
 Reference: [Ramamoorthi2001] (irradiance by nine harmonics).
 """
@@ -14,10 +14,6 @@ import numpy as np
 from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.mesh import Mesh
 
-FACE_LIMIT = 40_000
-"""About 700 kB on the page; the eye sees no difference at its size."""
-
-
 SHOWN_ACTIONS = ("eyeBlinkLeft", "eyeBlinkRight", "browInnerUp", "browDownLeft", "jawOpen", "mouthSmileLeft",
                  "mouthSmileRight", "mouthPucker")
 ACTION_STEP_MM, LEAST_STEPS = 0.01, 5
@@ -28,41 +24,12 @@ WET = (0.2, 0.63)
 one, whose catchlight fills some pixels. 0.63 times F0 = 0.04 is that of an index of refraction of 1.376."""
 
 
-def coarser(mesh: Mesh) -> Mesh | None:
-    """The mesh before its last subdivision, or None when it is none: F / 4 faces over the same vertices and UVs.
-
-    shared.geometry.mesh keeps the four children of a face together, three at its corners and one in the middle.
-    """
-    faces, face_uvs = _parents(mesh.faces), _parents(mesh.face_uvs)
-    return None if faces is None or face_uvs is None else mesh.replace(faces=faces, face_uvs=face_uvs)
-
-
-def _parents(faces: np.ndarray) -> np.ndarray | None:
-    if len(faces) % 4:
-        return None
-    at_a, at_b, at_c, middle = faces.reshape(-1, 4, 3).transpose(1, 0, 2)
-    edges = (at_a[:, 1], at_b[:, 2], at_c[:, 0])
-    others = (at_b[:, 0], at_c[:, 1], at_a[:, 2])
-    joined = all((one == other).all() for one, other in zip(edges, others, strict=True))
-    if not joined or not (middle == np.stack(edges, axis=1)).all():
-        return None
-    return np.stack([at_a[:, 0], at_b[:, 1], at_c[:, 2]], axis=1)
-
-
-def reduced(mesh: Mesh, face_limit: int = FACE_LIMIT) -> Mesh | None:
-    """The mesh with as many subdivisions taken back as the limit asks for; None when that does not suffice."""
-    current: Mesh | None = mesh
-    while current is not None and len(current.faces) > face_limit:
-        current = coarser(current)
-    return current
-
-
 def packed(
     mesh: Mesh, normals: np.ndarray, wet: np.ndarray | None = None, actions: Sequence[BlendShape] = ()
 ) -> dict:
     """For viewer.js: one vertex per distinct corner, positions and UVs as uint16, normals as int8, base64.
 
-    normals [V, 3], such as those of the mesh before it was reduced; wet [V] bool: vertices of the eyes, whose normals
+    normals [V, 3]: those of the mesh that this one was reduced from; wet [V] bool: vertices of the eyes, whose normals
     have a fourth component of 127, else 0. actions: of the mesh, of which those of SHOWN_ACTIONS are packed.
     -> {"count", "positions", "normals", "uvs", "faces", "low" [3], "size" [3], "actions"};
     position = low + size * q / 65535 mm. An action is {"name", "vertices", "offsets", "half"}: int16 in steps of

@@ -19,7 +19,7 @@ from shared.report.charts import line_chart, nice_ticks
 from shared.report.content import chosen_frames, excluded_frames, motion, number, warnings_of
 from shared.report.page import flat
 from shared.report.pictures import ERROR_RANGE, error_bytes, grey_bytes, shrunk, srgb_bytes, viridis_bytes
-from shared.report.viewer import ACTION_STEP_MM, coarser, irradiance_harmonics, packed, reduced
+from shared.report.viewer import ACTION_STEP_MM, irradiance_harmonics, packed
 from stages import export_usd
 
 NAME = '<script>alert("é")</script> & co'
@@ -302,17 +302,6 @@ def test_values_read_well():
     values = (0.0123456, 12, True, None, [1.0, 0.5], "a")
     assert [number(value) for value in values] == ["0.01235", "12", "yes", "-", "1, 0.5", "a"]
     assert flat({"fitted": 1.0, "held_out": {"p_95": 2.0}}) == [("fitted", 1.0), ("held out, p 95", 2.0)]
-
-
-def test_subdivision_is_taken_back():
-    base = sphere(1.0, 2)
-    fine = subdivide(subdivide(base))
-    back = coarser(coarser(fine))
-    np.testing.assert_array_equal(back.faces, base.faces)
-    np.testing.assert_array_equal(back.face_uvs, base.face_uvs)
-    assert len(reduced(fine, 1000).faces) == 512
-    shuffled = fine.replace(faces=np.roll(fine.faces, 1, axis=0), face_uvs=np.roll(fine.face_uvs, 1, axis=0))
-    assert coarser(shuffled) is None and reduced(shuffled, 1000) is None
 
 
 def test_packed_mesh_unpacks():

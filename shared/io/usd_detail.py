@@ -1,0 +1,48 @@
+"""Levels of detail in USD: the variant set `detail` of the default prim.
+
+Each variant holds the points, faces, texture coordinates, normals and blend shapes of the meshes; their prims, their
+motion and their materials stand outside of it and are the same for all. Whoever puts the head far away, or many heads
+into one scene, chooses a variant there; nobody has to change anything else.
+
+The meshes have no purpose, so that every program draws them. Purposes `render` and `proxy` would show a coarse mesh in
+viewports beside the full one in renders, both loaded, and nothing at all in readers that draw the purpose `default`
+only. They pay for scenes that a viewport cannot hold; one head of some 100,000 triangles is not one.
+
+Reference: UsdGeomImageable (purpose); USD Working Group, Guidelines for structuring USD assets (variants above the
+payload, so that they can be chosen before it is loaded).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from pxr import Usd
+
+DETAIL_SET, FULL = "detail", "full"
+REDUCED_FACES = {"20k": 20_000, "5k": 5_000}
+"""Variant -> how many faces head and eyes have together."""
+
+
+def define_details(root: Usd.Prim, names: Iterable[str]) -> None:
+    """The variants, of which the full one is chosen; none without names of reduced ones."""
+    names = tuple(names)
+    if names:
+        variants = root.GetVariantSets().AddVariantSet(DETAIL_SET)
+        for name in (FULL, *names):
+            variants.AddVariant(name)
+        variants.SetVariantSelection(FULL)
+
+
+def each_detail(root: Usd.Prim, names: Iterable[str]) -> Iterator[str]:
+    """FULL and each of the names, while what is written to the stage goes into the variant of that name; FULL alone,
+    and no variant, without names."""
+    names = tuple(names)
+    define_details(root, names)
+    if not names:
+        yield FULL
+        return
+    variants = root.GetVariantSet(DETAIL_SET)
+    for name in (*names, FULL):
+        variants.SetVariantSelection(name)
+        with variants.GetVariantEditContext():
+            yield name
