@@ -40,8 +40,9 @@ _PLACES = ((0.6, 0.2, 0.2), (0.2, 0.6, 0.2), (0.2, 0.2, 0.6), (0.45, 0.45, 0.1),
 """Corner weights of the points on a face where its distance is measured."""
 SLIMMEST = 0.05
 """Twice a face's area over the sum of its squared sides, below which it does not get slimmer: 0.58 is equilateral."""
-EYE_WEIGHT = 8.0
-"""How much an eyeball's faces count against others: it must fit under the lids, and turn there."""
+WEIGHTS = {"eyes": 8.0, "lids": 8.0, "lips": 4.0}
+"""How much faces of some segments count against others: whoever looks at a face looks there first, lids must fit about
+an eyeball that turns, and lips upon each other."""
 _SEAM, _OUTLINE, _BORDER, _FIXED = 1, 2, 4, 8
 _MOST_FACES = 64
 """Around a vertex that may still be taken away."""
@@ -77,8 +78,10 @@ def reduced(surface: Surface, wanted: Sequence[int]) -> tuple[ReducedMesh, ...]:
     spots = np.column_stack([mesh.vertices[pairs[:, 0]], _mm_per_uv(mesh) * mesh.uvs[pairs[:, 1]]])
     spots = np.ascontiguousarray(spots, np.float64)
     lines, kinds = _lines(mesh, wedges, labels)
-    eyes = np.zeros(len(labels), bool) if surface.face_segment is None else surface.faces_of(("eyes",))
-    quadrics = _quadrics(spots, wedges, lines, np.where(eyes, EYE_WEIGHT, 1.0))
+    weight = np.ones(len(labels))
+    for name, own in WEIGHTS.items() if surface.face_segment is not None else ():
+        weight[surface.faces_of((name,))] = own
+    quadrics = _quadrics(spots, wedges, lines, weight)
     faces, left, found = np.array(mesh.faces, np.int64), np.arange(len(mesh.faces)), []
     for count in wanted:
         alive = np.ones(len(faces), bool)
@@ -124,8 +127,8 @@ def _lines(mesh: Mesh, wedges: np.ndarray, labels: np.ndarray) -> tuple[np.ndarr
 
 
 def _quadrics(spots: np.ndarray, wedges: np.ndarray, lines: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """[W, _TERMS] of the planes of faces around each wedge, by area in the five dimensions times weight [F], and of
-    lines."""
+    """[W, _TERMS] of the planes of faces around each wedge, by area in the five dimensions, and of lines; times the
+    weight [F] of the face."""
     quadrics = np.zeros((len(spots), _TERMS))
     a, b, c = np.moveaxis(spots[wedges], 1, 0)
     along, along_length = _unit(b - a)
@@ -133,9 +136,10 @@ def _quadrics(spots: np.ndarray, wedges: np.ndarray, lines: np.ndarray, weight: 
     plane = _terms(a, (along, across)) * (0.5 * weight * along_length * across_length)[:, None]
     for corner in range(3):
         np.add.at(quadrics, wedges[:, corner], plane / 3.0)
-        one, two = wedges[lines[:, corner], corner], wedges[lines[:, corner], (corner + 1) % 3]
+        on_line = lines[:, corner]
+        one, two = wedges[on_line, corner], wedges[on_line, (corner + 1) % 3]
         along, length = _unit(spots[two] - spots[one])
-        line = _terms(spots[one], (along,)) * (LINE_WEIGHT * np.square(length))[:, None]
+        line = _terms(spots[one], (along,)) * (LINE_WEIGHT * weight[on_line] * np.square(length))[:, None]
         np.add.at(quadrics, one, line)
         np.add.at(quadrics, two, line)
     return quadrics
