@@ -22,8 +22,8 @@ from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.eyeballs import SIDES
 from shared.tracking.head_model import HeadModel
 
-LEAST_MM = 0.01
-"""A vertex moves if it does so by more than this."""
+LEAST_MM = 0.05
+"""A vertex moves if it does so by more than this: a quarter of a pixel where a face is 1000 pixels wide."""
 HIDDEN = ("eyes", "eye_sockets", "inner_mouth")
 """Nobody sees how these lie in a solved head: they do not count where it is compared with the model."""
 BLINKS = tuple(f"eyeBlink{side.capitalize()}" for side in SIDES)

@@ -22,11 +22,13 @@ class BlendShape:
         cls, name: str, moves: np.ndarray, least_mm: float, between: tuple[tuple[float, np.ndarray], ...] = ()
     ) -> BlendShape:
         """From displacements moves [V, 3] mm and those of in-betweens, of vertices that one of them moves by more than
-        least_mm."""
+        least_mm. Up to 4 least_mm they move by so much less, at most least_mm, that no step is left beside the others.
+        """
         largest = np.max([np.linalg.norm(each, axis=1) for each in (moves, *(own for _, own in between))], axis=0)
         used = np.nonzero(largest > least_mm)[0]
-        return cls(name, used.astype(np.int32), moves[used].astype(np.float32),
-                   tuple((weight, own[used].astype(np.float32)) for weight, own in between))
+        share = np.minimum(4.0 / 3.0 * (1.0 - least_mm / largest[used]), 1.0)[:, None]
+        return cls(name, used.astype(np.int32), (share * moves[used]).astype(np.float32),
+                   tuple((weight, (share * own[used]).astype(np.float32)) for weight, own in between))
 
     def at(self, weight: float) -> np.ndarray:
         """[n, 3] mm at a weight in [0, 1]: straight from one in-between to the next, as USD has it."""

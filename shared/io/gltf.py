@@ -35,7 +35,7 @@ from shared.io.export_maps import integer_codes
 from shared.io.usd_capture import UsdCapture, eye_turns, world_from_head_rigid, world_from_usd_camera
 
 METRES_PER_MM = 0.001
-_FLOAT, _UINT = 5126, 5125
+_FLOAT, _UINT, _USHORT = 5126, 5125, 5123
 _ARRAY, _INDEX = 34962, 34963
 _LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
 _FIRST_EYE = 2
@@ -79,7 +79,7 @@ class _Buffer:
 
     def sparse(self, count: int, index: np.ndarray, values: np.ndarray) -> int:
         """count vectors of 0 but those at index [n], in order, which are values [n, 3] -> index of the accessor."""
-        values = np.ascontiguousarray(values, "<f4")
+        values, short = np.ascontiguousarray(values, "<f4"), index.max(initial=0) < 2**16
         self.accessors.append({
             "componentType": _FLOAT,
             "count": count,
@@ -88,8 +88,8 @@ class _Buffer:
             "max": np.maximum(values.max(0), 0.0).tolist(),
             "sparse": {
                 "count": len(index),
-                "indices": {"bufferView": self.add(np.ascontiguousarray(index, "<u4").tobytes()),
-                            "componentType": _UINT},
+                "indices": {"bufferView": self.add(index.astype("<u2" if short else "<u4").tobytes()),
+                            "componentType": _USHORT if short else _UINT},
                 "values": {"bufferView": self.add(values.tobytes())},
             },
         })
@@ -163,10 +163,16 @@ def _morph_targets(shapes: Sequence[BlendShape]) -> dict[str, tuple[np.ndarray, 
 def _primitive(
     buffer: _Buffer, part: RigidPart, material: int, targets: Sequence[tuple[np.ndarray, np.ndarray]] = ()
 ) -> dict:
-    """glTF knows one index per corner: vertices are doubled along texture seams. targets: see _morph_targets."""
+    """glTF knows one index per corner: vertices are doubled along texture seams. targets: see _morph_targets; what they
+    move comes first, so that two bytes are enough for its indices."""
     mesh = part.mesh
     corners, index, _ = unique_pairs(np.column_stack([mesh.faces.ravel(), mesh.face_uvs.ravel()]))
-    vertex, coordinate = corners.T
+    moving = np.zeros(len(mesh.vertices), bool)
+    for moved, _ in targets:
+        moving[moved] = True
+    order = np.argsort(~moving[corners[:, 0]], kind="stable")
+    vertex, coordinate = corners[order].T
+    index = np.argsort(order)[index]
     attributes = {
         "POSITION": buffer.array(mesh.vertices[vertex] * METRES_PER_MM, _ARRAY, bounds=True),
         "NORMAL": buffer.array(part.normals[vertex], _ARRAY),
@@ -219,7 +225,9 @@ def _material(buffer: _Buffer, maps: Mapping[str, np.ndarray]) -> tuple[list[int
 def _png(picture: np.ndarray) -> bytes:
     """uint8 [H, W, 3] RGB or [H, W, 4] RGBA."""
     order = [2, 1, 0, 3][: picture.shape[2]]
-    done, encoded = cv2.imencode(".png", np.ascontiguousarray(picture[..., order]), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    settings = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
+                cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_PAETH]
+    done, encoded = cv2.imencode(".png", np.ascontiguousarray(picture[..., order]), settings)
     if not done:
         raise LimnError("a texture could not be encoded")
     return encoded.tobytes()

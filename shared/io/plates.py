@@ -12,7 +12,7 @@ from shared.errors import LimnError
 from shared.imaging.color import decode_transfer, encode_srgb
 from shared.io.frames import FrameSet
 
-LONGEST_SIDE, QUALITY = 1024, 88
+LONGEST_SIDE, QUALITY = 1024, 85
 
 
 def srgb_codes(frames: FrameSet) -> np.ndarray:
@@ -41,7 +41,7 @@ def write_plates(
         written[int(frame)] = f"{int(frame):04d}.jpg"
         path = folder / written[int(frame)]
         bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-        if not cv2.imwrite(str(path), bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY]):
+        if not cv2.imwrite(str(path), bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1]):
             raise LimnError(f"{path}: could not be written")
     return written
 

@@ -15,6 +15,20 @@ def test_what_hardly_moves_is_left_out():
     np.testing.assert_array_equal(SHAPE.offsets, MOVES[[1, 2, 4]])
 
 
+def test_between_what_is_left_out_and_the_rest_is_no_step():
+    """Longer moves stay longer, none changes by more than the least, those beyond four times the least not at all."""
+    long = np.linspace(0.0, 0.5, 2001)
+    moves = long[:, None] * [0.6, 0.0, 0.8]
+    shape = BlendShape.of("brow", moves, 0.05, ((0.5, 0.5 * moves),))
+    found = np.zeros_like(moves)
+    found[shape.vertices] = shape.offsets
+    length = np.linalg.norm(found, axis=1)
+    assert length[long <= 0.05].max() == 0.0 and np.abs(length - long).max() < 0.0501
+    assert (np.diff(length) >= -1e-7).all() and np.diff(length).max() < 1.4 * long[1]
+    np.testing.assert_allclose(length[long > 0.2001], long[long > 0.2001], rtol=1e-6)
+    np.testing.assert_allclose(shape.between[0][1], 0.5 * shape.offsets, atol=1e-7)
+
+
 def test_the_way_leads_through_the_in_between():
     for weight, expected in ((0.0, 0 * MOVES), (0.25, HALF / 2), (0.5, HALF), (0.75, (HALF + MOVES) / 2), (1.0, MOVES)):
         np.testing.assert_allclose(SHAPE.at(weight), expected[[1, 2, 4]], atol=1e-7)

@@ -25,6 +25,23 @@ def test_the_parts_together_are_the_mesh():
     assert all(set(part.mesh.faces.ravel()) == set(range(len(part.mesh.vertices))) for part in parts)
 
 
+def test_vertices_and_uvs_are_numbered_as_faces_use_them():
+    for part in head_parts(MESH, EYES):
+        for corners in (part.mesh.faces.ravel(), part.mesh.face_uvs.ravel()):
+            _, first = np.unique(corners, return_index=True)
+            assert (np.diff(first) > 0).all()
+
+
+def test_a_reduced_mesh_leaves_out_what_it_does_not_use():
+    """The normals that are given stay with their vertices."""
+    few = MESH.replace(faces=MESH.faces[:40], face_uvs=MESH.face_uvs[:40])
+    normals = shading_normals(MESH)
+    (head,) = head_parts(few, (), normals)
+    assert len(head.mesh.vertices) == len(np.unique(few.faces)) and len(head.mesh.uvs) == len(np.unique(few.face_uvs))
+    np.testing.assert_array_equal(head.mesh.vertices[head.mesh.faces], MESH.vertices[few.faces])
+    np.testing.assert_array_equal(head.normals, normals[head.vertices])
+
+
 def test_eyes_turn_about_their_centres():
     head, *eyes = head_parts(MESH, EYES)
     np.testing.assert_array_equal(head.pivot, 0.0)

@@ -222,8 +222,9 @@ def dense(content, binary, index):
     row, values = content["accessors"][index], None
     assert "bufferView" not in row and row["componentType"] == 5126
     parts = []
-    for part, kind, columns in (("indices", "<u4", 1), ("values", "<f4", 3)):
+    for part, kind, columns in (("indices", "<u2", 1), ("values", "<f4", 3)):
         view = content["bufferViews"][row["sparse"][part]["bufferView"]]
+        assert part == "values" or row["sparse"][part]["componentType"] == 5123
         assert "target" not in view and view["byteOffset"] % 4 == 0
         parts.append(np.frombuffer(binary, kind, row["sparse"]["count"] * columns, view["byteOffset"]))
     assert (np.diff(parts[0].astype(int)) > 0).all()
