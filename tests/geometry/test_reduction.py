@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from shapes import grid_plane, sphere
+from shapes import grid_plane, sphere, turned
 
 from shared.geometry.eyeballs import eyeballs_of
-from shared.geometry.mesh import Mesh, face_normals, mesh_edges
+from shared.geometry.mesh import Mesh, face_normals, interpolate, mesh_edges
 from shared.geometry.mesh_checks import mesh_errors, uv_overlap
+from shared.geometry.raycast import RayScene, camera_hits
 from shared.geometry.reduction import reduced
 from shared.geometry.surface import Surface
 from shared.tracking.models import load_head_model
@@ -99,6 +100,30 @@ def test_lines_stay(head, heads, kind, most_lost):
         assert set(left.ravel()) <= set(whole.ravel())
         own = np.linalg.norm(np.diff(found.mesh.vertices[left], axis=1), axis=-1).sum()
         assert (1.0 - most_lost) * length < own < 1.01 * length
+
+
+def seen_uvs(mesh, yaw_deg):
+    """[160 * 160, 2] UVs that a camera sees before the head, NaN beside it."""
+    pose = turned(np.radians([0.0, yaw_deg, 0.0]), (0.0, 0.0, 600.0))
+    lens = np.array([[300.0, 0.0, 80.0], [0.0, 300.0, 80.0], [0.0, 0.0, 1.0]])
+    face, bary, _ = camera_hits(RayScene(mesh.vertices, mesh.faces), pose, lens, 160, 160)
+    uvs = interpolate(mesh.uvs, mesh.face_uvs, face.ravel(), bary.reshape(-1, 3))
+    uvs[face.ravel() < 0] = np.nan
+    return uvs
+
+
+@pytest.mark.parametrize("yaw_deg", [-60.0, 0.0, 60.0])
+@pytest.mark.parametrize(("which", "largest_mm"), [(0, 0.25), (1, 1.3)])
+def test_the_texture_stays_where_it_was(head, heads, which, largest_mm, yaw_deg):
+    """From the front and from the sides, where both show the same island of the map."""
+    mesh = head.mesh
+    flat = np.column_stack([mesh.uvs, np.zeros(len(mesh.uvs))])
+    areas = [np.linalg.norm(face_normals(*each), axis=1).sum()
+             for each in ((mesh.vertices, mesh.faces), (flat, mesh.face_uvs))]
+    off = np.linalg.norm(seen_uvs(heads[which].mesh, yaw_deg) - seen_uvs(mesh, yaw_deg), axis=-1)
+    off_mm = off[np.isfinite(off)] * np.sqrt(areas[0] / areas[1])
+    assert len(off_mm) > 3000 and np.median(off_mm) < 0.35 * largest_mm
+    assert np.percentile(off_mm[off_mm < 20.0], 95) < largest_mm and (off_mm > 20.0).mean() < 0.01
 
 
 def topology(faces):
