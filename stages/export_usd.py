@@ -7,8 +7,9 @@ Reads    sample_frames: frames.json and the frames (for the plates and the repor
 Writes   head.usda with its payload, head.usdz, head.glb, mesh.obj, maps/*.exr, envmap.exr, envmaps/*.exr, poses.npz,
          plates/*.jpg, renders/*.exr, views/*.exr, run.json, methods.txt, report.html.
 Method   The head model's facial actions are carried over to the solved head, where the mesh is the model's, and written
-         as blend shapes. Units, axes, colour spaces and sources are stated on everything that is written; then the
-         asset is validated as a stranger would find it on disk.
+         as blend shapes. Edges of the full mesh are collapsed to meshes of fewer faces. Units, axes, colour spaces and
+         sources are stated on everything that is written; then the asset is validated as a stranger would find it on
+         disk.
 Fails    values that are not finite, a mesh with broken indices or UVs, a map that is not a square power of two,
          anything that usd-core's validators or the MaterialX definitions object to.
 """
