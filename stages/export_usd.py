@@ -199,8 +199,8 @@ def write_assets(job: Job, asset, eyeballs, poses: dict, maps: dict, envmap) -> 
     from shared.io.usdz import write_head_usdz
 
     write_obj(job.out / "mesh.obj", asset.mesh, eyeballs)
-    kept = {name: poses[name] for name in ("camera_from_head", "frame_index", "intrinsics", "gaze") if name in poses}
-    save_arrays(job.out / "poses.npz", **kept)
+    kept = ("camera_from_head", "frame_index", "intrinsics", "gaze", "gain")
+    save_arrays(job.out / "poses.npz", **{name: poses[name] for name in kept if name in poses})
     write_head_usda(job.out, asset)
     if job.params.usdz:
         write_head_usdz(job.out / "head.usdz", asset, maps, envmap)

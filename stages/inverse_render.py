@@ -66,7 +66,7 @@ PUBLISHED = ParameterGroup(
 
 STAGE = Stage(
     name="inverse_render",
-    version=34,
+    version=35,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -216,6 +216,7 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
     turning = result.eyes is not None
     turn = result.views.gaze[first : first + len(index)] if turning else None
     gaze = np.full_like(turn, np.nan) if turning and clip.gaze is None else clip.gaze
+    gain = None if result.views.gain is None else result.views.gain[first : first + len(index)]
     save_arrays(
         folder / "poses.npz",
         camera_from_head=poses,
@@ -224,6 +225,7 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
         intrinsics=frames.intrinsics_source,
         intrinsics_crop=frames.intrinsics,
         **({"gaze": gaze, "eye_turn": turn} if turning else {}),
+        **({} if gain is None else {"gain": gain}),
     )
     maps = SurfaceMaps(result.maps["diffuse_albedo"], result.maps["specular_intensity"])
     chosen = spread_frames(len(index), job.params.render_count)
@@ -231,6 +233,7 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
         eyes = LookingEyes(result.eyes, turn[f]) if turning else None
         image, _ = render_frame(result.viewer, result.shading, maps, first + f, poses[f], clip.lens, clip.views.size,
                                 eyes=eyes)
+        image = image if gain is None else image * gain[f]
         write_exr(folder / "renders" / f"{index[f]:06d}.exr", image, colour_space="lin_rec709_scene")
     held_out = index[~result.views.fitted[first : first + len(index)]]
     return {"render_frames": index[chosen].tolist(), "held_out_frames": held_out.tolist()}

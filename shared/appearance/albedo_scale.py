@@ -20,6 +20,7 @@ offer; ColorChecker patches "light skin" and "dark skin" (sRGB values of X-Rite,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -47,6 +48,8 @@ BRIGHTEST, BRIGHTEST_SIGMA = 0.95, 0.05
 """The quantile of the skin's albedo that no reference skin's exceeds, and by how much, in the logarithm, it may."""
 HIGHLIGHT_SIGMA = 0.08
 """Relative standard deviation of a specular intensity that the clip shows."""
+NINE_OF_TEN = 1.645
+"""Standard deviations to both sides of a normal distribution's mean that hold nine tenths of it."""
 MODEL_ERROR = 0.003
 """Share of the diffuse radiance that passes for highlights where shape or visibility are a little off."""
 
@@ -59,6 +62,32 @@ class Highlights:
     intensity: np.ndarray
     precision: np.ndarray
     diffuse_share: np.ndarray
+
+
+class ResolvedScale(NamedTuple):
+    """log_factor [3] on the light, the specular intensity, and the covariance [3, 3] of the former: of all statements
+    together, and prior_covariance [3, 3] of those on skin and light alone, which say something of any clip."""
+
+    log_factor: np.ndarray
+    specular: float
+    covariance: np.ndarray
+    prior_covariance: np.ndarray
+
+
+    def describe(self, skin: np.ndarray) -> dict:
+        """What solve.json says of how well skin's albedo [3] is known: deviations of logarithms, the interval that
+        holds it nine times of ten, and how much of that is known without the clip, as the precision of the priors on
+        skin and light over that of everything."""
+        luminance = LUMINANCE * skin / (LUMINANCE @ skin)
+        of = {"luminance": luminance, "red_over_green": np.array([1.0, -1.0, 0.0]),
+              "blue_over_green": np.array([0.0, -1.0, 1.0])}
+        sigma = {name: float(np.sqrt(row @ self.covariance @ row)) for name, row in of.items()}
+        reach = np.exp(NINE_OF_TEN * np.sqrt(np.diag(self.covariance)))
+        return {
+            "log_sigma": {name: round(value, 4) for name, value in sigma.items()},
+            "skin_albedo_90": np.round([skin / reach, skin * reach], 4).tolist(),
+            "prior_share": round(sigma["luminance"] ** 2 / float(luminance @ self.prior_covariance @ luminance), 4),
+        }
 
 
 @dataclass(frozen=True)
@@ -130,7 +159,7 @@ def resolve_scale(
     relative_light: np.ndarray | None = None,
     log_brightest: np.ndarray | None = None,
     whites: tuple[np.ndarray, np.ndarray] | None = None,
-) -> tuple[np.ndarray, float]:
+) -> ResolvedScale:
     """The factor on the light per channel and the specular intensity that are jointly most likely.
 
     The lobe returns the light's own colour and its strength has a known range, so highlights say something about the
@@ -141,9 +170,10 @@ def resolve_scale(
     whites: as chart, of the whites of the eyes.
     With a chart the highlights give s alone: on the scale their range has little to add, and the model's errors pass
     for highlights.
-    -> log k [3], and s, the prior's mean without highlights.
+    -> log k [3], and s, the prior's mean without highlights; covariances are Laplace's approximation.
     """
     matrix, right = scale_prior(log_albedo + log_irradiance, white_sigma, relative_light=relative_light)
+    prior_covariance = np.linalg.inv(matrix.T @ matrix)
     for wanted, covariance in filter(None, (chart, whites)):
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
         matrix = np.concatenate([matrix, whitening])
@@ -158,8 +188,13 @@ def resolve_scale(
             return unlikely
         return np.append(unlikely, np.maximum(log_brightest - log_factor - ceiling, 0.0) / BRIGHTEST_SIGMA)
 
+    def resolved(log_factor: np.ndarray, specular: float, jacobian: np.ndarray) -> ResolvedScale:
+        covariance = np.linalg.inv(jacobian.T @ jacobian)[:3, :3]
+        return ResolvedScale(log_factor, specular, covariance, prior_covariance)
+
     if highlights is None:
-        return least_squares(on_skin, alone, method="lm").x, mean
+        solved = least_squares(on_skin, alone, method="lm")
+        return resolved(solved.x, mean, solved.jac)
     spread = _highlight_spread(highlights, mean)
 
     def on_highlights(log_factor: np.ndarray, log_intensity: float) -> np.ndarray:
@@ -172,9 +207,9 @@ def resolve_scale(
 
     if chart is not None:
         solved = least_squares(lambda x: on_highlights(alone, x[0]), [np.log(mean)], method="lm").x
-        return alone, float(np.exp(solved[0]))
-    solved = least_squares(jointly, np.append(alone, np.log(mean)), method="lm").x
-    return solved[:3], float(np.exp(solved[3]))
+        return resolved(alone, float(np.exp(solved[0])), matrix)
+    solved = least_squares(jointly, np.append(alone, np.log(mean)), method="lm")
+    return resolved(solved.x[:3], float(np.exp(solved.x[3])), solved.jac)
 
 
 def _highlight_spread(highlights: Highlights, mean_intensity: float) -> np.ndarray:

@@ -23,7 +23,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from shared.appearance.albedo_scale import most_likely_irradiance
+from shared.appearance.albedo_scale import ResolvedScale, most_likely_irradiance
 from shared.capture.chart import COLUMNS, CORNERS, GLARE_SIGMA, PATCHES, ChartObservation, reflectances
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import WORLD_FROM_CAMERA, fibonacci_sphere, invert_rigid
@@ -216,9 +216,11 @@ def chart_normals(corners: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarr
     return np.array(normals), -4.0 * np.square(np.array(errors) / CORNER_SIGMA_PX)
 
 
-def describe_scale(chart: ChartStatement | None, skin: np.ndarray, whites: dict | None = None) -> dict:
+def describe_scale(
+    chart: ChartStatement | None, skin: np.ndarray, whites: dict | None = None, scale: ResolvedScale | None = None
+) -> dict:
     """albedo_scale of solve.json: what set the scale, and the skin's albedo [3] under it; whites: what the whites of
-    the eyes said, None: nothing.
+    the eyes said, None: nothing; scale: with its covariance, None: unknown.
 
     With a chart also what it said: the frames, the irradiance over pi on it, the deviation of its logarithm, and by
     which factor the albedo would be another by the priors alone (without highlights and whites).
@@ -231,6 +233,7 @@ def describe_scale(chart: ChartStatement | None, skin: np.ndarray, whites: dict 
         "method": f"a colour chart in view, and far weaker priors: {priors}" if chart else alone,
         "skin_albedo": np.round(skin, 4).tolist(),
         "skin_luminance": round(float(skin @ LUMINANCE), 4),
+        **({} if scale is None else scale.describe(skin)),
         **({} if whites is None else {"whites": whites}),
     }
     if chart is None:

@@ -9,6 +9,7 @@ from enum import Enum
 import numpy as np
 import torch
 
+from shared.appearance.albedo_scale import ResolvedScale
 from shared.appearance.light_step import LinearisedFit
 from shared.appearance.light_weights import weigh_samples
 from shared.appearance.local_roughness import SpecularEquations
@@ -56,7 +57,8 @@ class StepReport:
 
     fitted, held_out: residuals; cost: before it; rescaled: see ResolvedFit; skin_prior: what the prior on skin says
     against its albedo; specular_intensity, roughness; light_weights: of several lights, see weigh_samples; rise: by
-    what factor the robust loss on fitted samples rose; frame_errors [F]: each frame's mean absolute residual.
+    what factor the robust loss on fitted samples rose; frame_errors [F]: each frame's mean absolute residual; scale:
+    between light and albedo, as it was resolved, None while it waits.
     """
 
     fitted: float
@@ -69,6 +71,7 @@ class StepReport:
     light_weights: tuple[float, ...]
     rise: float
     frame_errors: np.ndarray
+    scale: ResolvedScale | None
 
     def judged(self, capture: Capture, independent: float) -> float:
         """The residual to judge by, raised by what the prior on skin says against the albedo: of held-out frames, of
@@ -107,7 +110,8 @@ class Solution:
     held-out frames said to that; highlights_count: whether highlights took part to the end; frame_errors [F]: each
     frame's mean absolute residual; local_specular: where the specular intensity varies with the face's segments, how;
     light_weights: of several lights, how much samples of each count against those of the light that the model follows
-    best; lamp: of the light, where it stands near."""
+    best; lamp: of the light, where it stands near; scale: between light and albedo, with its covariance, None where it
+    was not at rest."""
 
     state: AppearanceState
     iterations: tuple[dict, ...]
@@ -120,6 +124,7 @@ class Solution:
     local_specular: SpecularEquations | None = None
     light_weights: tuple[float, ...] = ()
     lamp: NearLamp | None = None
+    scale: ResolvedScale | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +201,7 @@ def fit_appearance(
     _, found, appearance = best
     return Solution(
         appearance, tuple(records), fitted=found.fitted, held_out=found.held_out, highlights_count=highlights_count,
-        frame_errors=found.frame_errors, light_weights=found.light_weights,
+        frame_errors=found.frame_errors, light_weights=found.light_weights, scale=found.scale,
         lamp=None if capture.lamp is None else capture.lamp.lamp,
     )
 
@@ -249,6 +254,7 @@ def step(
         light_weights=light_weights,
         rise=rise,
         frame_errors=errors.frame_errors(model),
+        scale=resolved.scale,
     )
     return FitState(appearance, errors), found
 

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from scipy.sparse.linalg import LinearOperator, cg
 
-from shared.appearance.albedo_scale import resolve_scale
+from shared.appearance.albedo_scale import ResolvedScale, resolve_scale
 from shared.appearance.preconditioner import MOST_TEXELS, LightPreconditioner, curvature_of_some
 from shared.appearance.problem import AppearanceProblem, AppearanceState
 from shared.appearance.projection import (
@@ -284,22 +284,23 @@ class LinearisedFit:
         if chart is not None:
             light = np.split(state.light, len(relative))[chart.light]
             chart = chart.log_factor(light, np.exp(log_albedo + log_irradiance + relative[chart.light]))
-        log_factor, specular = resolve_scale(
+        scale = resolve_scale(
             log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart=chart,
             relative_light=relative, log_brightest=problem.brightest_skin(albedo), whites=problem.said_by_whites(state),
         )
+        log_factor = scale.log_factor
         factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]
         irradiance, reflection = irradiance * factor, reflection * factor
         state = replace(
             _with_albedo(state, albedo),
             params=state.light_model.scaled(state.params, log_factor),
-            specular=float(np.clip(specular, *SPECULAR_RANGE)) if settings.specular else 0.0,
+            specular=float(np.clip(scale.specular, *SPECULAR_RANGE)) if settings.specular else 0.0,
         )
         # What points of few samples are pulled to has the new scale, too.
         state = replace(state, albedo=state.albedo * np.exp(-log_factor))
         albedo = self._albedo(state, irradiance, state.specular * reflection)
         changed = float(np.abs(log_factor).max())
-        return ResolvedFit(_with_albedo(state, albedo), transport, irradiance, reflection, albedo, changed)
+        return ResolvedFit(_with_albedo(state, albedo), transport, irradiance, reflection, albedo, changed, scale)
 
     def _albedo(self, state: AppearanceState, irradiance: torch.Tensor, highlights: torch.Tensor) -> torch.Tensor:
         typical = self.problem.typical_albedo(state)
@@ -309,7 +310,8 @@ class LinearisedFit:
 @dataclass(frozen=True, eq=False)
 class ResolvedFit:
     """A state whose scale is resolved, its transport, irradiance and reflection [3, P, F] and albedo [3, P, 1];
-    rescaled: by how much the scale changed at most, in the logarithm, or the roughness while it moves."""
+    rescaled: by how much the scale changed at most, in the logarithm, or the roughness while it moves; scale: as it was
+    resolved, None while it waits."""
 
     state: AppearanceState
     transport: Transport
@@ -317,6 +319,7 @@ class ResolvedFit:
     reflection: torch.Tensor
     albedo: torch.Tensor
     rescaled: float
+    scale: ResolvedScale | None = None
 
 
 def _with_albedo(state: AppearanceState, albedo: torch.Tensor) -> AppearanceState:

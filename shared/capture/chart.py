@@ -11,7 +11,7 @@ Reference: [Mccamy1976] (the chart).
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -70,6 +70,10 @@ class ChartObservation:
     log_sigma: np.ndarray
     frame: int
     frame_index: int
+
+    def over(self, gain: np.ndarray) -> ChartObservation:
+        """The same once a gain [3] of the frame is taken out."""
+        return replace(self, values=self.values / gain, white=self.white / gain)
 
     @classmethod
     def from_record(cls, record: dict, crop: tuple[float, float, float], frame_index: np.ndarray) -> ChartObservation:

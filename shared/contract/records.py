@@ -17,6 +17,8 @@ GAZE = Field("gaze", "Where the right and the left eye look: yaw to +x, pitch to
 EYE_TURN = Field("eye_turn", "The same with which the mesh's eyeballs, turned about their own centres, show the irises "
                  "where the clip does: a fitted head's are some millimetres off.", "float64", "F, 2, 2", "rad",
                  optional=True)
+GAIN = Field("gain", "By how much the frame's red, green and blue are brighter than the still light makes them: "
+             "exposure and white balance. Absent where they stay.", "float64", "F, 3", optional=True)
 SOURCE_LENS = Field("intrinsics", "The camera matrix of the full source frame.", "float64", "3, 3", "px")
 CROP_LENS = Field("intrinsics_crop", "The camera matrix of the crop.", "float64", "3, 3", "px")
 
@@ -176,7 +178,8 @@ INIT = (
     Field("seen_share", "Share of the head's texels that the frames show."),
 )
 
-SOLVED_POSES = (POSES, replace(COVARIANCE, optional=True), FRAME_INDEX, SOURCE_LENS, CROP_LENS, GAZE, EYE_TURN)
+SOLVED_POSES = (POSES, replace(COVARIANCE, optional=True), FRAME_INDEX, SOURCE_LENS, CROP_LENS, GAZE, EYE_TURN,
+                GAIN)
 _REFERENCE = "solver=reference only:"
 _CANDIDATES = (
     Field("part", "Part of the model.", "text"),
@@ -241,6 +244,15 @@ _SCALE = (
     Field("albedo_scale.method", "In words.", "text"),
     Field("albedo_scale.skin_albedo", "The skin's median albedo under it.", shape="3"),
     Field("albedo_scale.skin_luminance", "Its luminance."),
+    Field("albedo_scale.log_sigma", "Standard deviations of logarithms, by all statements about the scale together. "
+          "Absent where the scale did not come to rest, and with solver=reference.", "", optional=True),
+    Field("albedo_scale.log_sigma.luminance", "Of the skin's luminance."),
+    Field("albedo_scale.log_sigma.red_over_green", "Of its tint."),
+    Field("albedo_scale.log_sigma.blue_over_green", "The same."),
+    Field("albedo_scale.skin_albedo_90", "The interval that holds the skin's albedo nine times of ten: lower and upper "
+          "end of each channel.", shape="2, 3", optional=True),
+    Field("albedo_scale.prior_share", "How much of what is known of the luminance is known without the clip: precision "
+          "of the priors on skin and light over that of everything.", optional=True),
     Field("albedo_scale.whites", "What the whites of the eyes said; absent where the clip hardly shows them.", "",
           optional=True),
     Field("albedo_scale.whites.places", "The places on them that are seen often enough.", "int"),
@@ -305,6 +317,12 @@ SOLVE = (
           unit="deg", optional=True),
     Field("poses.turned_deg", "How far they turned in all, rms.", unit="deg", optional=True),
     *_LAMP,
+    Field("exposure", "Gains of the frames; absent where exposure and white balance stay.", "", optional=True),
+    Field("exposure.brightness", "Standard deviation of their logarithm."),
+    Field("exposure.tint", "The same of red against blue."),
+    Field("exposure.beside_turn", "What a light without gains left over beside what goes with the head's turn.", ""),
+    Field("exposure.beside_turn.brightness", "Standard deviation of its logarithm."),
+    Field("exposure.beside_turn.tint", "The same of red against blue."),
     Field("relief", "The normal map; empty with normal_map=false, absent with solver=reference.", "", optional=True),
     Field("relief.prior_radians", "Expected size of the turns.", unit="rad", optional=True),
     Field("relief.confirmed_share", "Share of the turns that held-out frames confirm.", optional=True),
@@ -354,7 +372,7 @@ SOLVE = (
 
 SELECTION_TIMES = (Field("[]", "Seconds of each entry of `model_selection` in solve.json, in order.", unit="s"),)
 
-EXPORTED_POSES = (POSES, FRAME_INDEX, SOURCE_LENS, GAZE)
+EXPORTED_POSES = (POSES, FRAME_INDEX, SOURCE_LENS, GAZE, GAIN)
 _STAGE_RECORD = (
     Field("version", "The stage's version.", "int"),
     Field("parameters.**", "Its parameters as used.", ""),

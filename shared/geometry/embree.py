@@ -20,7 +20,7 @@ from numba.extending import intrinsic
 RAY_WORDS, _ALIGNMENT = 24, 64
 """As embree lays it out, and a little more: newer versions add words at the end. Where it wants it, in bytes."""
 FAR = np.float32(1e30)
-MASK, U, V, FACE, GEOMETRY, FARTHEST = 9, 15, 16, 17, 18, 8
+MASK, FACE, GEOMETRY, FARTHEST = 9, 17, 18, 8
 """Places of words in a ray."""
 
 _TRIANGLES, _INDICES, _PLACES, _UINT3, _FLOAT3, _WATERTIGHT = 0, 0, 1, 0x5003, 0x9003, 4

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from shared.compute.compiled import compiled
-from shared.geometry.embree import FACE, FAR, FARTHEST, GEOMETRY, MASK, Triangles, U, V, call_embree, ray_buffer
+from shared.geometry.embree import FACE, FAR, FARTHEST, GEOMETRY, MASK, Triangles, call_embree, ray_buffer
 from shared.geometry.transforms import camera_centres
 
 RAY_START_MM = 0.05
@@ -20,43 +20,39 @@ class RayScene:
     """An acceleration structure over vertices [V, 3] and faces [F, 3]. triangles: for other compiled loops."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
-        self.triangles = Triangles(vertices, faces)
+        self.triangles, self.vertices, self.faces = Triangles(vertices, faces), vertices, faces
 
     def occluded(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """[N, 3], [N, 3] -> [N] bool: does anything lie along the ray (any distance)?"""
-        face, _ = self._traced(self.triangles.occluded, origins, directions)
-        return face >= 0
+        return self._traced(self.triangles.occluded, origins, directions) >= 0
 
     def first_faces(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """[N, 3], [N, 3] -> the face that each ray meets first [N] int32, -1: none."""
-        face, _ = self._traced(self.triangles.intersect, origins, directions)
-        return face
+        return self._traced(self.triangles.intersect, origins, directions)
 
     def intersect(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """[N, 3], [N, 3] -> face [N] int32 (-1: nothing hit), bary [N, 3] corner weights, distance [N].
 
-        Distances are in units of the direction's length; where nothing is hit they are infinite.
+        Distances are in units of the direction's length; where nothing is hit they are infinite. Which face it is
+        embree says; where on it, doubles do: each processor's embree approximates reciprocals in its own way.
         """
-        face, place = self._traced(self.triangles.intersect, origins, directions)
-        u, v, distance = place.T
-        bary = np.stack([1.0 - u - v, u, v], axis=1)  # here, since compiled sums may be reordered
-        missed = face < 0
-        bary[missed] = 0.0
-        return face, bary, np.where(missed, np.float32(np.inf), distance)
+        face = self.first_faces(origins, directions)
+        bary, distance = np.zeros((len(face), 3), np.float32), np.full(len(face), np.inf, np.float32)
+        hit = face >= 0
+        bary[hit], distance[hit] = on_faces(self.vertices, self.faces, face[hit], origins[hit], directions[hit])
+        return face, bary, distance
 
-    def _traced(
-        self, function: np.uint64, origins: np.ndarray, directions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """By embree's function -> face [N], its u and v and the distance [N, 3], 0 where nothing is hit."""
+    def _traced(self, function: np.uint64, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """By embree's function -> face [N], -1 where nothing is hit."""
         origins, directions = np.asarray(origins, np.float32), np.asarray(directions, np.float32)
-        face, place = np.empty(len(origins), np.int32), np.zeros((len(origins), 3), np.float32)
-        _trace(function, self.triangles.scene, *ray_buffer(), origins, directions, face, place)
-        return face, place
+        face = np.empty(len(origins), np.int32)
+        _trace(function, self.triangles.scene, *ray_buffer(), origins, directions, face)
+        return face
 
 
 @compiled
-def _trace(function, scene, ray, words, address, origins, directions, face, place):
-    """Rays [N, 3] -> face [N], -1: none; where rtcIntersect1 hits: u, v and distance [N, 3]."""
+def _trace(function, scene, ray, words, address, origins, directions, face):
+    """Rays [N, 3] -> face [N], -1: none."""
     for n in range(len(origins)):
         for k in range(3):
             ray[k], ray[4 + k] = origins[n, k], directions[n, k]
@@ -66,7 +62,6 @@ def _trace(function, scene, ray, words, address, origins, directions, face, plac
         face[n] = -1
         if words[GEOMETRY] != -1:
             face[n] = words[FACE]
-            place[n, 0], place[n, 1], place[n, 2] = ray[U], ray[V], ray[FARTHEST]
         elif words[FARTHEST] < 0:  # rtcOccluded1 says so by an infinite negative distance, and not what it met
             face[n] = 0
 

@@ -105,6 +105,11 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 
+def turns_from_mean(rotations: np.ndarray) -> np.ndarray:
+    """[F, 3] rotation vectors (camera axes) of rotations [F, 3, 3] from their mean."""
+    return vector_from_rotation(rotations @ nearest_rotation(rotations.sum(0)).T)
+
+
 def similarity_from_points(
     source: np.ndarray, target: np.ndarray, with_scale: bool = True, weights: np.ndarray | None = None
 ) -> tuple[float, np.ndarray, np.ndarray]:

@@ -20,7 +20,8 @@ class Views:
     one light in a row; fitted [F] bool: the other frames are held out; read_picture(f), read_mask(f): see picture and
     mask; gaze [F, 2, 2] radians: with which the mesh's right and left eyeball show the irises where the pictures do,
     NaN while shut (shared/geometry/eyeballs.py), None: not known, so that eyeballs do not turn; lids_px [F, 2, N, 2]: a
-    polygon about what the lids leave open of each eye, NaN where it is not seen, None: as the mesh has it.
+    polygon about what the lids leave open of each eye, NaN where it is not seen, None: as the mesh has it; gain [F, 3]:
+    what makes a frame brighter than the still light does, which `picture` takes out, None: nothing does.
     """
 
     camera_from_head: np.ndarray
@@ -33,6 +34,7 @@ class Views:
     read_mask: Callable[[int], np.ndarray]
     gaze: np.ndarray | None = None
     lids_px: np.ndarray | None = None
+    gain: np.ndarray | None = None
 
     @classmethod
     def in_one_light(
@@ -66,8 +68,9 @@ class Views:
         return len(self.camera_from_head)
 
     def picture(self, f: int) -> Picture:
-        """Frame f, decoded and ready for sampling."""
-        return self.read_picture(int(f))
+        """Frame f, decoded and ready for sampling, as bright as the still light makes it."""
+        picture = self.read_picture(int(f))
+        return picture if self.gain is None else picture.dimmed(self.gain[f])
 
     def mask(self, f: int) -> np.ndarray:
         """Frame f's mask [H, W] uint8, 0: background."""
@@ -90,8 +93,9 @@ class Views:
             intrinsics=self.intrinsics[frames],
             light_index=self.light_index[frames],
             fitted=self.fitted[frames] if fitted is None else fitted,
-            read_picture=lambda k: self.picture(frames[k]),
+            read_picture=lambda k: self.read_picture(int(frames[k])),
             read_mask=lambda k: self.mask(frames[k]),
             gaze=None if self.gaze is None else self.gaze[frames],
             lids_px=None if self.lids_px is None else self.lids_px[frames],
+            gain=None if self.gain is None else self.gain[frames],
         )

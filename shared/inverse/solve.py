@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from shared.appearance.chart_scale import describe_scale, scale_warnings, state_chart
+from shared.appearance.chart_scale import ChartStatement, describe_scale, scale_warnings, state_chart
 from shared.appearance.diagnostics import diagnostic_warnings, diagnostics_of, face_regions
 from shared.appearance.eye_whites import describe_whites
 from shared.appearance.fine_normals import NormalPass, resolved_texels
@@ -27,6 +27,7 @@ from shared.imaging.texels import TexelSurface
 from shared.imaging.turning_eyes import LIDS, EyeTexels, TurningEyes
 from shared.imaging.views import Views
 from shared.inverse.clip_inputs import TrackedPoses
+from shared.inverse.exposure import exposure_warnings, solve_exposure
 from shared.inverse.lamp_distance import describe_lamp, find_lamp
 from shared.inverse.lit_surface import LitSurface, report_to
 from shared.inverse.model_selection import SelectedModel, select
@@ -68,14 +69,7 @@ def solve_clip(
         contour = settings.shape.contour
         surface, outline = meet_outline(some_views(views, settings, contour.frames), surface, contour, context)
         viewer = SurfaceViewer.of(surface.mesh)
-    chart, chart_warning = state_chart(
-        observations,
-        viewer.scene,
-        views.camera_from_head,
-        views.intrinsics,
-        settings.appearance.light_moves(views.moves),
-        light=int(views.light_index[observations[0].frame]) if observations else 0,
-    )
+    chart, chart_warning = said_by_chart(observations, viewer, views, settings)
     selected = SelectedModel(surface, settings)
     if settings.selection is not None:
         selected = select(views, surface, settings, chart, context)
@@ -90,6 +84,18 @@ def solve_clip(
 
     # A lamp that stands near, where held-out frames ask for one.
     by_lamp = find_lamp(lit, solution, light_views, settings, chart, context)
+
+    # Where the camera's exposure wandered, all of it anew from frames as bright as one still light makes them.
+    exposure = solve_exposure(views, by_lamp.lit, by_lamp.solution, settings, context)
+    if exposure is not None:
+        views = replace(views, gain=exposure.gain)
+        steady = [observation.over(exposure.gain[observation.frame]) for observation in observations]
+        chart, chart_warning = said_by_chart(steady, viewer, views, settings)
+        light_views = some_views(views, settings, settings.light_frames)
+        lit = LitSurface.of(selected.surface, light_views, settings, chart, context)
+        solution = fit_appearance(lit.coarse, settings.appearance, report_to(context), start=exposure.solution,
+                                  shapes=True)
+        by_lamp = find_lamp(lit, solution, light_views, settings, chart, context)
     lit, solution = by_lamp.lit, by_lamp.solution
 
     # Then closer directions where a lamp shines, the mesh refined under that light, and the poses anew on that mesh.
@@ -132,17 +138,32 @@ def solve_clip(
         "texture": texture_record,
         "shape": {**shape_record, "outline": outline},
         "poses": pose_record,
+        "exposure": {} if exposure is None else exposure.record,
         "lamp": describe_lamp(solution.lamp, solution.state.light, by_lamp.record, views,
                               settings.appearance.light_moves(views.moves)),
         "relief": relief,
         "diagnostics": diagnostics,
         "warnings": [*filter(None, [chart_warning]), *scale_warnings(chart, typical),
-                     *diagnostic_warnings(diagnostics, views.moves)],
-        "albedo_scale": describe_scale(chart, typical, whites),
+                     *exposure_warnings(exposure), *diagnostic_warnings(diagnostics, views.moves)],
+        "albedo_scale": describe_scale(chart, typical, whites, solution.scale),
         "model_selection": selected.candidates,
     }
     maps = make_maps(texels, material, roughness, turn, None if eye_texels is None else eye_texels.rows)
     return InverseResult(solution, material, maps, shading, viewer, views, record, covariance, eyes)
+
+
+def said_by_chart(
+    observations: Sequence[ChartObservation], viewer: SurfaceViewer, views: Views, settings: InverseSettings
+) -> tuple[ChartStatement | None, str]:
+    """What a chart in view says, or None and a warning: see state_chart."""
+    return state_chart(
+        observations,
+        viewer.scene,
+        views.camera_from_head,
+        views.intrinsics,
+        settings.appearance.light_moves(views.moves),
+        light=int(views.light_index[observations[0].frame]) if observations else 0,
+    )
 
 
 def examine(
@@ -215,6 +236,7 @@ def summarise(result: InverseResult, moves: str) -> dict:
             "contradicted_held_out": result.record["texture"]["contradicted"]["held_out"],
         },
         **{key: result.record[key] for key in ("shape", "poses", "relief", "diagnostics") if key in result.record},
+        **({"exposure": exposure} if (exposure := result.record.get("exposure")) else {}),
         **({"lamp": lamp} if (lamp := result.record.get("lamp")) else {}),
         **({"model_selection": [dict(candidate) for candidate in tried]} if tried else {}),
         "iterations": list(solution.iterations),

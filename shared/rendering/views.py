@@ -105,9 +105,10 @@ def held_out_cameras(
 
 
 def clip_camera(poses: Mapping[str, np.ndarray], f: int, lens: np.ndarray, size: tuple[int, int]) -> ViewCamera:
-    """Camera f of a poses.npz with a lens [3, 3] and a picture's size (width, height), px, and the gaze if it has one.
-    """
-    return ViewCamera(poses["camera_from_head"][f], lens, size, poses["eye_turn"][f] if "eye_turn" in poses else None)
+    """Camera f of a poses.npz with a lens [3, 3] and a picture's size (width, height), px, with gaze and gain if it has
+    them."""
+    gaze, gain = (poses[name][f] if name in poses else None for name in ("eye_turn", "gain"))
+    return ViewCamera(poses["camera_from_head"][f], lens, size, gaze, gain)
 
 
 def frontal_frame(camera_from_head: np.ndarray) -> int:
@@ -216,6 +217,7 @@ class HeadViews:
                 self.viewer, shading, self.maps, k, camera.camera_from_head, camera.intrinsics, camera.size,
                 eyes=self._looking(camera),
             )
+            picture = picture if camera.gain is None else picture * camera.gain
             pictures.append(picture * covered[..., None] if fade else picture)
         return pictures
 

@@ -32,6 +32,8 @@ _ADVICE = (
     (r"faces in the clip",
      "Look at the contact sheet; if it shows the wrong person, crop the clip or film one person."),
     (r"beyond the picture's edge", "Film again with room around the head: what leaves the picture has no texture."),
+    (r"exposure wanders",
+     "Lock exposure and white balance, and keep the light still: gains that go with the head's turn pass for shading."),
     (r"brightness wanders|flicker",
      "Lock the exposure and keep the light still; maps from this clip average over its changes."),
     (r"colour wanders", "Lock the white balance; maps from this clip average over its changes."),

@@ -52,6 +52,9 @@ REFERENCES = {
                  "1999.",
     "Horn1975": "Horn, Obtaining Shape from Shading Information. The Psychology of Computer Vision, McGraw-Hill 1975.",
     "Immerkaer1996": "Immerkaer, Fast Noise Variance Estimation. Computer Vision and Image Understanding 64, 1996.",
+    "Irons1969":
+        "Irons, Tuck, A Version of the Aitken Accelerator for Computer Iteration. International Journal for Numerical "
+        "Methods in Engineering 1, 1969.",
     "Jakob2022": "Jakob et al., Mitsuba 3 renderer. 2022.",
     "Kabsch1976":
         "Kabsch, A Solution for the Best Rotation to Relate Two Sets of Vectors. Acta Crystallographica A32, 1976.",

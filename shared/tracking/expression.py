@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from shared.compute.robust import ROBUST_SCALE
-from shared.geometry.transforms import rotation_range_deg
+from shared.geometry.transforms import rotation_range_deg, turns_from_mean
 from shared.tracking.head_model import HeadModel
-from shared.tracking.pose_uncertainty import turns_from_mean
 
 LIMIT_MM, JITTERS = 3.0, 7.0
 """Another expression: so far from the common one, and by so many times what the nose's landmarks jitter by from frame

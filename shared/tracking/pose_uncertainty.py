@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from shared.compute.parallel import shared_out
-from shared.geometry.transforms import nearest_rotation, vector_from_rotation
+from shared.geometry.transforms import nearest_rotation, turns_from_mean, vector_from_rotation
 from shared.tracking.bundle import BundleSolution, Tracks, adjust, pose_covariance, zoomed
 from shared.tracking.first_poses import LOSS, Adjusted, adjust_clip
 from shared.tracking.focal_search import PRIOR_MM, farther, look_elsewhere
@@ -93,11 +93,6 @@ def rotations_apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     [F, 3, 3], second [F, 3, 3]."""
     common = nearest_rotation(np.einsum("fji,fjk->ik", second, first))
     return vector_from_rotation(first @ np.swapaxes(second @ common, 1, 2))
-
-
-def turns_from_mean(rotations: np.ndarray) -> np.ndarray:
-    """[F, 3] rotation vectors (camera axes) of rotations [F, 3, 3] from their mean."""
-    return vector_from_rotation(rotations @ nearest_rotation(rotations.sum(0)).T)
 
 
 def focal_elsewhere(clip: TrackedClip, flow: Adjusted) -> tuple[float, float] | None:

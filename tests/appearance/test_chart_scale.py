@@ -145,14 +145,14 @@ def test_the_scale_follows_the_chart_against_the_priors():
     log_albedo, log_irradiance = np.log([0.5, 0.3, 0.22]), np.log([1.0, 1.0, 1.0])
     wanted = np.log([0.6, 0.5, 0.45])
     covariance = np.full((3, 3), 0.04**2) + np.diag(np.full(3, 0.012**2))
-    alone, _ = resolve_scale(log_albedo, log_irradiance, None, (0.7, 0.25))
-    found, _ = resolve_scale(log_albedo, log_irradiance, None, (0.7, 0.25), chart=(wanted, covariance))
+    alone, *_ = resolve_scale(log_albedo, log_irradiance, None, (0.7, 0.25))
+    found, *_ = resolve_scale(log_albedo, log_irradiance, None, (0.7, 0.25), chart=(wanted, covariance))
     assert np.abs(alone - wanted).max() > 0.2
     np.testing.assert_allclose(found, wanted, atol=0.03)
-    weak, _ = resolve_scale(log_albedo, log_irradiance, None, (0.7, 0.25), chart=(wanted, covariance * 1e6))
+    weak, *_ = resolve_scale(log_albedo, log_irradiance, None, (0.7, 0.25), chart=(wanted, covariance * 1e6))
     np.testing.assert_allclose(weak, alone, atol=0.01)
     shiny = Highlights(np.full(3, 0.6), np.full(3, 1e4), np.full(3, 8.0))
-    with_shine, specular = resolve_scale(log_albedo, log_irradiance, shiny, (0.7, 0.25), chart=(wanted, covariance))
+    with_shine, specular, *_ = resolve_scale(log_albedo, log_irradiance, shiny, (0.7, 0.25), chart=(wanted, covariance))
     np.testing.assert_allclose(with_shine, found, atol=1e-9)
     wished = 0.6 / np.exp(found).mean()
     assert 0.7 < specular < wished  # between the prior's mean and the samples, and nearer to them

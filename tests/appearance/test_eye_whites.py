@@ -136,7 +136,7 @@ def test_shadows_that_the_light_gets_wrong_say_little_and_scatter_makes_unsure()
 
 def test_whites_move_the_scale_as_far_as_they_are_sure():
     skin, wanted = np.log(np.median(REFERENCE_SKINS, axis=0)), np.full(3, -0.8)
-    alone, _ = resolve_scale(skin, np.zeros(3), None, (0.7, 0.25))
+    alone, *_ = resolve_scale(skin, np.zeros(3), None, (0.7, 0.25))
 
     def with_whites(sigma: float) -> np.ndarray:
         return resolve_scale(skin, np.zeros(3), None, (0.7, 0.25), whites=(wanted, sigma**2 * np.eye(3)))[0]
@@ -151,7 +151,7 @@ def test_wide_highlights_do_not_darken_skin_beside_bright_whites():
     skin = np.log(np.median(REFERENCE_SKINS, axis=0))
     strong = Highlights(np.full(3, 1.4), np.full(3, 1e4), np.full(3, 5.0))
     whites = np.zeros(3), 0.33**2 + 0.5 * 0.15**2 * np.eye(3)
-    without, _ = resolve_scale(skin, np.zeros(3), strong, (0.7, 0.25))
-    beside, intensity = resolve_scale(skin, np.zeros(3), strong, (0.7, 0.25), whites=whites)
+    without, *_ = resolve_scale(skin, np.zeros(3), strong, (0.7, 0.25))
+    beside, intensity, *_ = resolve_scale(skin, np.zeros(3), strong, (0.7, 0.25), whites=whites)
     assert (without > 0.5).all() and (0.0 < beside).all() and (beside < 0.75 * without).all()
     assert intensity > 0.7

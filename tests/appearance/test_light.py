@@ -2,16 +2,21 @@
 
 import numpy as np
 import pytest
+from field_check import below, field_faults
 
 from shared.appearance.albedo_scale import (
+    HIGHLIGHT_SIGMA,
+    MODEL_ERROR,
     REFERENCE_SKINS,
     Highlights,
     fit_skin_locus,
     most_likely_irradiance,
     resolve_scale,
 )
+from shared.appearance.chart_scale import describe_scale
 from shared.appearance.light import FrameLight, LightPriors, LogPrior, resample_light
 from shared.appearance.light_models import make_light_model, real_harmonics
+from shared.contract.records import SOLVE
 from shared.geometry.transforms import fibonacci_sphere, rotation_from_vector
 from shared.imaging.color import LUMINANCE
 from shared.imaging.frame_index import hold_out, spread_frames
@@ -169,10 +174,10 @@ def test_highlights_tell_a_bright_light_from_bright_skin():
     skin, mean = on_the_locus(), (0.7, 0.35)
     light = np.full(3, np.log(2.0))
     found = Highlights(np.full(3, 0.35), np.full(3, 100.0), np.ones(3))
-    log_factor, specular = resolve_scale(skin - light, light, found, mean)
+    log_factor, specular, *_ = resolve_scale(skin - light, light, found, mean)
     assert np.allclose(log_factor, -np.log(2.0), atol=1e-6)
     assert specular == pytest.approx(0.7, rel=1e-6)
-    without, specular = resolve_scale(skin - light, light, None, mean)
+    without, specular, *_ = resolve_scale(skin - light, light, None, mean)
     assert np.allclose(without, -np.log(2.0), atol=1e-6) and specular == 0.7
     stronger = Highlights(np.full(3, 0.7), np.full(3, 100.0), np.ones(3))
     assert (resolve_scale(skin - light, light, stronger, mean)[0] > -np.log(2.0) + 0.05).all()
@@ -182,20 +187,48 @@ def test_highlights_that_are_not_there_say_little():
     """An intensity below 0 within its error is a faint highlight, not an infinitely fainter light."""
     skin = on_the_locus()
     faint = Highlights(np.array([-0.2, 0.2, 0.4]), np.full(3, 4.0), np.full(3, 10.0))
-    log_factor, specular = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25))
+    log_factor, specular, *_ = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25))
     assert (np.abs(log_factor) < 0.6).all() and 0.5 < specular < 0.8
+
+
+def test_what_is_known_of_the_scale_adds_up_as_precisions():
+    skin, prior = on_the_locus(), (0.7, 0.35)
+    alone = resolve_scale(skin, np.zeros(3), None, prior)
+    np.testing.assert_allclose(alone.covariance, alone.prior_covariance, rtol=1e-4)
+    said = np.diag([0.02, 0.03, 0.05]) ** 2
+    both = resolve_scale(skin, np.zeros(3), None, prior, chart=(np.zeros(3), said))
+    np.testing.assert_allclose(both.covariance, np.linalg.inv(np.linalg.inv(alone.covariance) + np.linalg.inv(said)))
+    shine = resolve_scale(skin, np.zeros(3), Highlights(np.full(3, 0.7), np.full(3, 1e6), np.ones(3)), prior)
+    jointly = np.zeros((4, 4))  # of the three factors and of the intensity, which highlights show the product of
+    jointly[:3, :3], jointly[3, 3] = np.linalg.inv(alone.covariance), prior[1] ** -2
+    for channel in np.eye(4)[:3] + np.eye(4)[3]:
+        jointly += np.outer(channel, channel) / (HIGHLIGHT_SIGMA**2 + MODEL_ERROR**2)
+    np.testing.assert_allclose(shine.covariance, np.linalg.inv(jointly)[:3, :3], rtol=0.01)
+
+
+def test_the_record_of_the_scale_states_its_interval():
+    skin = np.exp(on_the_locus())
+    alone = resolve_scale(np.log(skin), np.zeros(3), None, (0.7, 0.35))
+    record = alone.describe(skin)
+    low, high = np.array(record["skin_albedo_90"])
+    np.testing.assert_allclose(low * high, skin**2, rtol=1e-3)
+    np.testing.assert_allclose(np.log(high / low) / 2, 1.645 * np.sqrt(np.diag(alone.covariance)), rtol=1e-3)
+    assert record["prior_share"] == pytest.approx(1.0, rel=1e-4)
+    share = LUMINANCE * skin / (LUMINANCE @ skin)
+    assert record["log_sigma"]["luminance"] ** 2 == pytest.approx(share @ alone.covariance @ share, rel=1e-3)
+    assert field_faults(describe_scale(None, skin, scale=alone), below(SOLVE, "albedo_scale")) == []
 
 
 def test_no_skin_returns_more_than_the_lightest():
     """Faint highlights ask for a dim light on light skin; its brightest places say how light it can be."""
     skin = np.log([0.6, 0.4, 0.3])
     faint = Highlights(np.full(3, 0.2), np.full(3, 1e4), np.full(3, 2.0))
-    free, _ = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25))
-    held, _ = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25), log_brightest=skin + 0.15)
+    free, *_ = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25))
+    held, *_ = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25), log_brightest=skin + 0.15)
     assert np.exp(skin + 0.15 - free).max() > 1.0
     assert np.exp(skin + 0.15 - held).max() < 0.95
     dark = on_the_locus()
-    unhindered, _ = resolve_scale(dark, np.zeros(3), None, (0.7, 0.25), log_brightest=dark + 0.15)
+    unhindered, *_ = resolve_scale(dark, np.zeros(3), None, (0.7, 0.25), log_brightest=dark + 0.15)
     assert np.allclose(unhindered, resolve_scale(dark, np.zeros(3), None, (0.7, 0.25))[0], atol=1e-6)
 
 

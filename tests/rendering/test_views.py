@@ -1,5 +1,7 @@
 """Novel and relit views: against closed forms on a sphere, and against the solver's own re-render."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -46,6 +48,15 @@ def test_even_light_shows_the_albedo():
         picture = views.render(even_light(), [orbit_camera(ball(), yaw, pitch, PIXELS)])[0]
         middle = picture[PIXELS // 2 - 10 : PIXELS // 2 + 10, PIXELS // 2 - 10 : PIXELS // 2 + 10]
         np.testing.assert_allclose(middle, ALBEDO, rtol=0.01)
+
+
+def test_a_cameras_gain_brightens_its_picture():
+    camera = orbit_camera(ball(), 0.0, 0.0, PIXELS)
+    views = HeadViews(ball(), ball_maps(0.0), SIZES)
+    gain = np.array([1.5, 1.0, 0.5])
+    plain, brightened = views.render(even_light(), [camera, replace(camera, gain=gain)])
+    np.testing.assert_allclose(brightened, plain * gain, rtol=1e-6)
+    assert plain.max() > 0.0
 
 
 def test_specular_adds_its_share():

@@ -62,6 +62,15 @@ def test_truth_scores_perfectly_against_itself(tmp_path):
     assert scores["rerender"]["psnr"] > 60 and "relight" not in scores
 
 
+def test_a_frames_own_gain_is_no_error_of_its_render(tmp_path):
+    export, gain = export_from_truth(tmp_path / "export"), np.array([1.2, 1.0, 0.9])
+    poses = load_arrays(export / "poses.npz")
+    save_arrays(export / "poses.npz", **poses, gain=np.tile(gain, (len(poses["frame_index"]), 1)))
+    render, = (export / "renders").iterdir()
+    write_exr(render, read_exr(render) * gain.astype(np.float32), colour_space="data")
+    assert score(TINY, export)["rerender"]["psnr"] > 60
+
+
 def test_another_head_frame_scale_and_gains_change_nothing_but_the_raw_scores(tmp_path):
     plain = score(TINY, export_from_truth(tmp_path / "plain"))
     moved = score(TINY, export_from_truth(tmp_path / "moved", moved=True, gain=GAIN))

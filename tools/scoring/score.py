@@ -160,9 +160,9 @@ def score_appearance(
             pairs[name].append((read_exr(f"{stem}_{name}.exr")[row, column], seen[name][hit]))
         if CONFIDENCE in seen:
             confidence.append(seen[CONFIDENCE][hit].ravel())
-        render = find_image(result.folder / "renders", f"{frame:04d}")
-        if render:
-            rendered.append((read_exr(f"{stem}_radiance.exr")[mask], read_linear(render)[mask]))
+        render = read_render(result.folder, frame)
+        if render is not None:
+            rendered.append((read_exr(f"{stem}_radiance.exr")[mask], render[mask]))
     scores: dict = {
         "normal_deg": measures.summary(np.concatenate(angles)),
         "mask_coverage": float(np.mean(coverage)),
@@ -179,6 +179,16 @@ def score_appearance(
     return scores
 
 
+def read_render(export: Path, frame: int) -> np.ndarray | None:
+    """[H, W, 3] linear: a re-render of a frame without the frame's own gain, which truth has none of; None where there
+    is none."""
+    path, poses = find_image(export / "renders", f"{frame:04d}"), load_arrays(export / "poses.npz")
+    if path is None:
+        return None
+    gain = poses["gain"][poses["frame_index"] == frame][0] if "gain" in poses else 1.0
+    return (read_linear(path) / gain).astype(np.float32)
+
+
 def score_eyes(subject: Path, export: Path, truth: dict[str, np.ndarray], truth_from_result: np.ndarray) -> dict:
     """{gaze, rerender_eyes} against what gt/poses.npz says of living eyes; gaze is None where the result has none, and
     rerender_eyes is left out where it renders no frame that holds truth. truth_from_result [3, 3]."""
@@ -186,11 +196,11 @@ def score_eyes(subject: Path, export: Path, truth: dict[str, np.ndarray], truth_
     scores: dict = {"gaze": gaze.gaze_errors(truth["gaze"], found, truth_from_result) if found else None}
     pairs = {}
     for frame in truth["gt_frames"].tolist():
-        stem, render = subject / "gt" / "frames" / f"{frame:04d}", find_image(export / "renders", f"{frame:04d}")
+        stem, render = subject / "gt" / "frames" / f"{frame:04d}", read_render(export, frame)
         if render is not None:
             inside = gaze.eye_pixels(read_exr(f"{stem}_depth.exr"), truth["camera_from_head"][frame], truth["K"],
                                      truth["eyeball_centres"], float(truth["eyeball_radius"]))
-            pairs[frame] = read_exr(f"{stem}_radiance.exr")[inside], read_linear(render)[inside]
+            pairs[frame] = read_exr(f"{stem}_radiance.exr")[inside], render[inside]
     solve = export.parent / "work" / "inverse_render" / "solve.json"
     held = [pairs[i] for i in (read_json(solve)["held_out_frames"] if solve.exists() else []) if i in pairs]
     if pairs:

@@ -4,5 +4,5 @@ Read in this order: makehuman, topology, shapes, embedding, segments, relaxation
 May import: shared.
 """
 
-VERSION = 2
+VERSION = 3
 """Changes whenever the built model changes: set-up then builds it anew."""
