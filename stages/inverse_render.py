@@ -12,7 +12,7 @@ Method   What no track reaches (ears, skull, jaw) moves until the mesh's outline
          On it all frames are tracked again; where that turns the poses by what matters, mesh and light follow from the
          new ones. Light is summed along directions that lie close where a small lamp passes. Where there is one, it
          stands at the distance that held-out frames ask for, far away if they ask for none
-         (shared/inverse/lamp_distance.py).
+         (shared/inverse/lamp_distance.py). Exposure that drifts is a gain of each frame (shared/inverse/exposure.py).
          Or (model=auto) the model is chosen first, on few points and frames: shared/selection/candidates.py. Then
          albedo and specular intensity per texel in closed form, streaming over the frames; samples where a cast shadow
          ends, which the mesh tells to millimetres only, count less. The solver starts from a uniform light and the

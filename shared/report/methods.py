@@ -164,6 +164,7 @@ def _solving(records: RunRecords) -> Iterable[str]:
     else:
         yield from _transfer(parameters)
         yield from _lamp(records.solve.get("lamp") or {})
+        yield from _exposure(records.solve.get("exposure") or {})
     yield from _shape(parameters, records.solve.get("shape") or {})
     residuals, held_out = records.solve.get("residuals", {}), records.solve.get("held_out_frames", ())
     if isinstance(residuals.get("held_out"), float) and isinstance(residuals.get("fitted"), float):
@@ -205,6 +206,13 @@ def _lamp(lamp: Mapping[str, object]) -> Iterable[str]:
                "standard error {Breiman1984}.")
 
 
+def _exposure(exposure: Mapping[str, float]) -> Iterable[str]:
+    if exposure:
+        yield (f"Exposure, which wandered by {exposure['brightness']:.0%}, and white balance, by "
+               f"{exposure['tint']:.0%}, were solved as a gain of each frame and channel beside the still light "
+               "{Irons1969}.")
+
+
 def _shape(parameters: Mapping[str, object], shape: Mapping[str, object]) -> Iterable[str]:
     if parameters.get("mesh"):
         yield "The mesh was given."
@@ -225,6 +233,10 @@ def _scale(records: RunRecords) -> Iterable[str]:
                "in view {Mccamy1976}.")
     elif "method" in scale:
         yield (f"The scale between light and albedo, which no clip tells by itself, was set by {scale['method']}.")
+    if "log_sigma" in scale:
+        deviation = scale["log_sigma"]["luminance"]
+        yield (f"By these the skin's luminance is known to {deviation:.0%} (standard deviation of the logarithm), "
+               f"{scale['prior_share']:.0%} of which is known without the clip.")
 
 
 def _export(records: RunRecords) -> Iterable[str]:

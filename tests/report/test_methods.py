@@ -100,6 +100,15 @@ def test_export_writes_it_and_the_report_shows_it(tmp_path):
 TRIED = [{"distance_mm": None, "held_out": 0.03}, {"distance_mm": 700.0, "held_out": 0.02}]
 
 
+def test_gains_and_what_is_known_of_the_scale_are_stated():
+    exposure = {"brightness": 0.07, "tint": 0.03}
+    scale = {"method": "priors", "log_sigma": {"luminance": 0.21}, "prior_share": 0.4}
+    text = flat(methods_text(records(solve=SOLVE | {"exposure": exposure, "albedo_scale": scale})))
+    assert "Exposure, which wandered by 7%, and white balance, by 3%" in text and "Irons" in text
+    assert "luminance is known to 21%" in text and "40% of which" in text
+    assert "wandered" not in methods_text(records())
+
+
 @pytest.mark.parametrize("lamp, says", [
     ({"near": True, "distance_mm": 650.0, "tried": TRIED}, "main lamp stands 0.65 m from the head"),
     ({"distance_mm": 500.0}, "main lamp was said to stand 0.50 m from the head"),
