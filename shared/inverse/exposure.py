@@ -1,19 +1,21 @@
 """Exposure and white balance that drift: by how much each frame is brighter than one still light makes it.
 
 What the solved light leaves over of a frame as a whole is a gain of three numbers. Such gains are solved only where the
-clip asks for them: what of them goes with the head's turn may be the light's own error, and where the rest is next to
-nothing the camera was locked. Where it is not, light and gains are solved in turn. A light that took gains for shading
+clip asks for them: where they are as large as people are warned of, and where what does not go with the head's turn is
+half of that at least, since the rest may be the light's own error. On skin that no rigid model fits exactly, smaller
+ones would trade tints between light and albedo. Light and gains are solved in turn. A light that took gains for shading
 lets go of them, since shading also changes from one side of the face to the other within a frame; but only by and by,
 so each change is extrapolated from the last two (Aitken's process for vectors, [Irons1969]).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shared.appearance.diagnostics import frame_gains
+from shared.appearance.diagnostics import WANDERING_GAIN, WANDERING_TINT, frame_gains
 from shared.appearance.fit import Solution, fit_appearance
 from shared.appearance.observations import Capture, build_capture
 from shared.appearance.problem import AppearanceProblem, AppearanceSettings
@@ -25,8 +27,9 @@ from shared.inverse.lit_surface import LitSurface
 from shared.inverse.problem import FACE_SKIN, InverseSettings
 from shared.rendering.near_lamp import SeenLamp
 
-LEAST_DEVIATION = 0.015
-"""Of the logarithm of gains that do not go with the head's turn; locked cameras have 0.002 to 0.006."""
+LEAST_DEVIATIONS = {"brightness": WANDERING_GAIN, "tint": WANDERING_TINT}
+BESIDE_TURN = 0.5
+"""Share of these by which gains that do not go with the head's turn deviate: a locked camera's do by 0.0025 in all."""
 LEAST_FRAMES = 20
 """Of fewer nearly all can go with the head's turn."""
 POINTS, STEPS = 400, 3
@@ -54,14 +57,20 @@ def solve_exposure(
 
     The head is brighter where it comes nearer to a near lamp, so that its lamp is known before.
     """
-    wandering = deviations(beside_turn(left_over(lit.coarse, solution, settings.appearance), lit.coarse))
-    if max(wandering.values()) < LEAST_DEVIATION:
+    left = centred(left_over(lit.coarse, solution, settings.appearance), lit.coarse)
+    wandering = deviations(beside_turn(left, lit.coarse))
+    if not asks_for_gains(deviations(left), wandering):
         return None
     _, steady = solve_gains(lit.coarse.some_points(POINTS), solution, settings.appearance, context)
     log_gain = gains_under(steady, capture_of_all(views, lit, solution, settings, context), settings.appearance)
     record = {**deviations(log_gain), "beside_turn": wandering}
     context.note(f"exposure that wanders: {record}")
     return Exposure(np.exp(log_gain), steady, record)
+
+
+def asks_for_gains(left: Mapping[str, float], beside: Mapping[str, float]) -> bool:
+    """Whether what a still light leaves over, and what of that does not go with the head's turn, are large enough."""
+    return any(left[kind] > least and beside[kind] > BESIDE_TURN * least for kind, least in LEAST_DEVIATIONS.items())
 
 
 def capture_of_all(

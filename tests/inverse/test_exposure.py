@@ -17,9 +17,9 @@ from shared.contract.records import GAIN, SOLVE
 from shared.geometry.transforms import rotation_from_vector
 from shared.inverse import exposure
 from shared.inverse.exposure import (
-    LEAST_DEVIATION,
     LEAST_FRAMES,
     Exposure,
+    asks_for_gains,
     beside_turn,
     centred,
     deviations,
@@ -81,7 +81,19 @@ def test_only_a_camera_that_is_not_locked_asks_for_gains(truth, wandered, matte,
     settings = SimpleNamespace(appearance=matte)
     assert solve_exposure(None, SimpleNamespace(coarse=truth), fit_appearance(truth, matte), settings, SILENT) is None
     seen, _, misled = wandered
-    assert deviations(beside_turn(left_over(seen, misled, matte), seen))["brightness"] > 2.0 * LEAST_DEVIATION
+    left = left_over(seen, misled, matte)
+    assert asks_for_gains(deviations(left), deviations(beside_turn(left, seen)))
+
+
+@pytest.mark.parametrize("left, beside, asks", [
+    ({"brightness": 0.1, "tint": 0.0}, {"brightness": 0.08, "tint": 0.0}, True),
+    ({"brightness": 0.0, "tint": 0.1}, {"brightness": 0.0, "tint": 0.08}, True),
+    ({"brightness": 0.1, "tint": 0.0}, {"brightness": 0.01, "tint": 0.0}, False),
+    ({"brightness": 0.02, "tint": 0.03}, {"brightness": 0.02, "tint": 0.03}, False),
+    ({"brightness": 0.1, "tint": 0.03}, {"brightness": 0.01, "tint": 0.03}, False),
+])  # fmt: skip
+def test_gains_are_asked_for_by_one_kind_that_is_large_and_not_the_turns(left, beside, asks):
+    assert asks_for_gains(left, beside) is asks
 
 
 def test_what_goes_with_the_turn_is_left_to_the_light():
