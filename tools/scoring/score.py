@@ -182,9 +182,10 @@ def score_appearance(
 def read_render(export: Path, frame: int) -> np.ndarray | None:
     """[H, W, 3] linear: a re-render of a frame without the frame's own gain, which truth has none of; None where there
     is none."""
-    path, poses = find_image(export / "renders", f"{frame:04d}"), load_arrays(export / "poses.npz")
+    path = find_image(export / "renders", f"{frame:04d}")
     if path is None:
         return None
+    poses = load_arrays(export / "poses.npz")
     gain = poses["gain"][poses["frame_index"] == frame][0] if "gain" in poses else 1.0
     return (read_linear(path) / gain).astype(np.float32)
 
