@@ -73,7 +73,6 @@ class ResolvedScale(NamedTuple):
     covariance: np.ndarray
     prior_covariance: np.ndarray
 
-
     def describe(self, skin: np.ndarray) -> dict:
         """What solve.json says of how well skin's albedo [3] is known: deviations of logarithms, the interval that
         holds it nine times of ten, and how much of that is known without the clip, as the precision of the priors on

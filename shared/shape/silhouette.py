@@ -115,7 +115,7 @@ def _turning_points(mesh, normals, edges, scene, pose, intrinsics) -> tuple[np.n
     pixels = project(points, pose, intrinsics)[0] + BEYOND_PX * outward
     rays = (pixels - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]]
     rays = np.concatenate([rays, np.ones((len(pixels), 1))], axis=1) @ pose[:3, :3]
-    free = scene.intersect(np.broadcast_to(centre, rays.shape), rays)[0] < 0
+    free = scene.first_faces(np.broadcast_to(centre, rays.shape), rays) < 0
     return turning[free], share[free], outward[free]
 
 

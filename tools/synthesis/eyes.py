@@ -103,7 +103,7 @@ class LivingEyes:
         front = self.centres[side] + np.column_stack([grid, np.full(len(grid), self.radius)])
         towards = np.array([*slope, -1.0])
         origins = (front - BEFORE_MM * towards).astype(np.float32)
-        face, _, _ = scene.intersect(origins, np.tile(towards.astype(np.float32), (len(grid), 1)))
+        face = scene.first_faces(origins, np.tile(towards.astype(np.float32), (len(grid), 1)))
         return (face >= 0) & (self.face_side[faces[face]] == side)
 
 

@@ -103,6 +103,6 @@ def _apart(head: Head, vertices: np.ndarray, mouth: _Mouth, columns: np.ndarray)
     for tilt in TILTS:
         origins = mouth.middle + np.stack([x, y - tilt * BEFORE_MM, np.full_like(x, BEFORE_MM)], -1).reshape(-1, 3)
         towards = np.tile(np.float32([0.0, tilt, -1.0]), (len(origins), 1))
-        face, _, _ = scene.intersect(origins.astype(np.float32), towards)
+        face = scene.first_faces(origins.astype(np.float32), towards)
         apart |= ((face < 0) | within[face]).reshape(x.shape).any(0)  # the throat lies deeper than what is near
     return apart
