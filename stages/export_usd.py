@@ -357,7 +357,8 @@ def run(job: Job) -> None:
     eyeballs = eyeballs_of(surface) or ()
     eyes = eyeballs if "eye_turn" in poses else ()
     actions, said_of_them = find_actions(job, surface)
-    details = dict(zip(REDUCED_FACES, reduced(surface, tuple(REDUCED_FACES.values())), strict=True))
+    wanted = REDUCED_FACES if params.detail else {PAGE_DETAIL: REDUCED_FACES[PAGE_DETAIL]}
+    details = dict(zip(wanted, reduced(surface, tuple(wanted.values())), strict=True))
     asset = describe_asset(job, mesh, eyes, actions, details if params.detail else {},
                            describe_capture(job, poses, frames), frames, writer, lamp)
     write_assets(job, asset, eyeballs, poses, maps, far)

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from shared.actions.crossings import TOUCHING
 from shared.actions.eyelids import HALF, Eyelids
 from shared.actions.folds import SkinFolds
 from shared.actions.lips import LipContact
@@ -26,6 +25,9 @@ LEAST_MM = 0.05
 """A vertex moves if it does so by more than this: a quarter of a pixel where a face is 1000 pixels wide."""
 HIDDEN = ("eyes", "eye_sockets", "inner_mouth")
 """Nobody sees how these lie in a solved head: they do not count where it is compared with the model."""
+TOUCHING = ("lids", "eyes", "eye_sockets", "lips", "inner_mouth")
+"""Segments in which skin touches skin, or an eyeball. The rims of a fitted head's lids, deeper than real ones, reach
+into the ball at rest."""
 BLINKS = tuple(f"eyeBlink{side.capitalize()}" for side in SIDES)
 """Of the right and the left eye."""
 

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
-from shared.geometry.intersections import crossing_edges
+from shared.geometry.intersections import crossing_edges, edges_beside
 from shared.geometry.mesh import normalised, vertex_adjacency, vertex_normals
 from shared.tracking.head_model import HeadModel
 
@@ -101,8 +101,7 @@ class LipContact:
     def _crossing(self, placed: np.ndarray) -> np.ndarray:
         """Vertices of edges that pass through faces, and did not at rest."""
         edges = crossing_edges(placed, self.faces)
-        known = np.isin(edges @ [len(placed), 1], self.at_rest @ [len(placed), 1])
-        return np.unique(edges[~known])
+        return np.unique(edges_beside(edges, self.at_rest))
 
     def _pushed(self, placed: np.ndarray, least: np.ndarray, share: np.ndarray) -> np.ndarray:
         """Both sides moved apart until their gap is the least [n] mm, by a share [n] of the way."""

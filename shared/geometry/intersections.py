@@ -41,6 +41,12 @@ def crossing_edges(vertices: np.ndarray, faces: np.ndarray, edges: np.ndarray | 
     return edges[found]
 
 
+def edges_beside(edges: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """[n, 2] those of the edges [E, 2] that are not among the known ones [K, 2], both as crossing_edges gives them."""
+    count = 1 + max(int(edges.max(initial=0)), int(known.max(initial=0)))
+    return edges[~np.isin(edges @ [count, 1], known @ [count, 1])]
+
+
 def turned_faces(start: np.ndarray, moved: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """[F] bool: faces that the move from start to moved [V, 3] turns over or shrinks to next to nothing."""
     before, after = face_normals(start, faces), face_normals(moved, faces)
@@ -60,7 +66,7 @@ def move_without_crossing(start: np.ndarray, wanted: np.ndarray, faces: np.ndarr
         near = _near(placed, edges, (placed != last).any(1))
         some_faces, some_edges = faces[near[faces].any(1)], edges[near[edges].any(1)]
         crossing = crossing_edges(placed, some_faces, some_edges)
-        crossing = _without(crossing, crossing_edges(start, some_faces, crossing))
+        crossing = edges_beside(crossing, crossing_edges(start, some_faces, crossing))
         turned = turned_faces(start, placed, faces)
         if len(crossing) == 0 and not turned.any():
             return placed
@@ -80,8 +86,3 @@ def _near(vertices: np.ndarray, edges: np.ndarray, moved: np.ndarray) -> np.ndar
     longest = float(np.linalg.norm(vertices[edges[:, 1]] - vertices[edges[:, 0]], axis=1).max())
     distance = cKDTree(vertices[moved]).query(vertices, distance_upper_bound=2.0 * longest)[0]
     return np.isfinite(distance)
-
-
-def _without(edges: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Edges [N, 2] that are not among the others [M, 2]."""
-    return edges[~(edges[:, None] == others[None]).all(2).any(1)]

@@ -6,9 +6,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from toy_result import toy_eyed_surface
 
-from shared.actions.crossings import TOUCHING, new_crossings
-from shared.actions.facial import BLINKS, LEAST_MM, facial_actions, levels_of
+from shared.actions.facial import BLINKS, LEAST_MM, TOUCHING, facial_actions, levels_of
 from shared.actions.names import named_actions
+from shared.geometry.blend_shapes import BlendShape
+from shared.geometry.intersections import crossing_edges, edges_beside
+from shared.geometry.surface import Surface
 from shared.tracking.head_model import HeadModel
 
 FAR_FROM_CONTACT = ("forehead", "nose", "brows", "cheek_left", "cheek_right", "chin", "jaw")
@@ -18,6 +20,20 @@ def with_actions(model: HeadModel, *names: str) -> HeadModel:
     """The model with only these of its own actions."""
     chosen = [model.expression_names.index(name) for name in names]
     return replace(model, expression_basis=model.expression_basis[chosen], expression_names=names)
+
+
+def new_crossings(surface: Surface, shape: BlendShape, weight: float = 1.0) -> dict[str, int]:
+    """{segment: edges that pass through a face with the action at a weight and do not at rest}; an edge counts for the
+    segment of its first vertex, and where one of both lies outside of TOUCHING, for that one's."""
+    vertices, faces = surface.mesh.vertices, surface.mesh.faces
+    edges = crossing_edges(shape.applied(vertices, weight), faces)
+    edges = edges_beside(edges, crossing_edges(vertices, faces, edges))
+    of_vertex = np.zeros(len(vertices), int)
+    of_vertex[faces] = surface.face_segment[:, None]
+    ends = np.array(surface.segment_names)[of_vertex[edges]]
+    chosen = np.where(np.isin(ends[:, 0], TOUCHING), ends[:, 1], ends[:, 0])
+    chosen = np.where(np.isin(chosen, TOUCHING), ends[:, 0], chosen)
+    return {str(name): int(count) for name, count in zip(*np.unique(chosen, return_counts=True), strict=True)}
 
 
 def test_a_head_has_all_of_the_models_actions(solved, model):
