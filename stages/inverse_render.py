@@ -66,7 +66,7 @@ PUBLISHED = ParameterGroup(
 
 STAGE = Stage(
     name="inverse_render",
-    version=35,
+    version=36,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -129,8 +129,8 @@ STAGE = Stage(
                   1e7, former="evidence"),
         Parameter("chart", bool, True, "Take the light's scale from the colour chart that sample_frames found."),
         Parameter("shape", bool, True, "Refine the mesh from shading, parallax and tracks."),
-        Parameter("silhouette", bool, True, "Before the solve, move ears, skull and jaw so that the outline meets the "
-                  "person mask's border."),
+        Parameter("silhouette", bool, True, "Move ears, skull and jaw so that the outline meets the person mask's "
+                  "border, cheeks, chin and jaw so that it meets the face's edge in the pictures."),
         Parameter("shape_subdivisions", int, 1, "Times that the mesh is subdivided for that.", "", 0, 2),
         Parameter("shape_steps", int, 2, "Most steps of the shape before what it sees is traced again.", "", 1, 20,
                   former="shape_rounds"),

@@ -40,6 +40,7 @@ class RayScene:
         bary, distance = np.zeros((len(face), 3), np.float32), np.full(len(face), np.inf, np.float32)
         hit = face >= 0
         bary[hit], distance[hit] = on_faces(self.vertices, self.faces, face[hit], origins[hit], directions[hit])
+        face[np.isinf(distance)] = -1
         return face, bary, distance
 
     def _traced(self, function: np.uint64, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -70,17 +71,20 @@ def on_faces(
     vertices: np.ndarray, faces: np.ndarray, face: np.ndarray, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Corner weights [N, 3] and distance [N], in units of the direction's length, where rays [N, 3] meet the planes of
-    the faces face [N]: in doubles, where embree's single precision would be taken for a change of the surface.
+    the faces face [N]: in doubles, where embree's single precision would be taken for a change of the surface. A ray
+    that lies in its face's plane meets it nowhere: infinite distance, no weights.
 
     Reference: [Moeller1997].
     """
     a, b, c = np.moveaxis(np.asarray(vertices, np.float64)[faces[face]], 1, 0)
     first, second, away = b - a, c - a, origins - a
     across = np.cross(directions, second)
-    scale = 1.0 / (first * across).sum(1)
-    turned = np.cross(away, first)
+    volume, turned = (first * across).sum(1), np.cross(away, first)
+    meets = volume != 0.0
+    scale = np.divide(1.0, volume, out=np.zeros(len(volume)), where=meets)
     u, v = scale * (away * across).sum(1), scale * (directions * turned).sum(1)
-    return np.stack([1.0 - u - v, u, v], axis=1), scale * (second * turned).sum(1)
+    bary = np.stack([1.0 - u - v, u, v], axis=1) * meets[:, None]
+    return bary, np.where(meets, scale * (second * turned).sum(1), np.inf)
 
 
 def pixel_directions(

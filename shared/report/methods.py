@@ -219,7 +219,8 @@ def _shape(parameters: Mapping[str, object], shape: Mapping[str, object]) -> Ite
     if parameters.get("poses"):
         yield "The poses were given."
     if parameters.get("silhouette") and "outline" in shape:
-        yield "Ears, skull and jaw were moved so that the outline meets the person masks {Cipolla2000}."
+        yield ("Ears, skull and jaw were moved so that the outline meets the person masks {Cipolla2000}, cheeks, "
+               "chin and jaw so that it meets the face's edges in the pictures {Tabatabai1984}.")
     if shape.get("refined"):
         yield "The mesh was refined from shading, parallax and tracks in large smooth steps {Nicolet2021}."
     elif "refined" in shape:

@@ -119,6 +119,9 @@ REFERENCES = {
     "Szeliski1997":
         "Szeliski, Kang, Shape Ambiguities in Structure from Motion. IEEE Transactions on Pattern Analysis and "
         "Machine Intelligence 19, 1997.",
+    "Tabatabai1984":
+        "Tabatabai, Mitchell, Edge Location to Subpixel Values in Digital Imagery. IEEE Transactions on Pattern "
+        "Analysis and Machine Intelligence 6 (2), 1984.",
     "Thuermer1998":
         "Thürmer, Wüthrich, Computing Vertex Normals from Polygonal Facets. Journal of Graphics Tools 3, 1998.",
     "Triggs2000":

@@ -29,8 +29,9 @@ from shared.rendering.precomputed_transfer import PrecomputedTransfer, Sizes, pr
 from shared.rendering.shading import DEEP, Material, VertexShading
 from shared.rendering.transfer import Nodes, Points, Transfer, mesh_points, nearest_points
 from shared.shape.equations import EquationSettings, PointEquations, point_equations
+from shared.shape.occluding_contour import ContourSettings
 from shared.shape.samples import SurfaceView, look_at_surface, sample_surface
-from shared.shape.silhouette import ContourSettings
+from shared.shape.silhouette import FaceOutline
 from shared.shape.step import (
     LARGEST_STEP_EDGES,
     large_step_metric,
@@ -155,7 +156,9 @@ class ShapeSolver:
         sizes: Sizes,
         settings: ShapeSettings,
         context: RunContext = SILENT,
+        outline: FaceOutline | None = None,
     ):
+        self.outline = outline
         self.views, self.tracks, self.reflectance = views, tracks, reflectance
         self.appearance, self.sizes, self.settings, self.context = appearance, sizes, settings, context
 
@@ -242,6 +245,8 @@ class ShapeSolver:
             rows, height, weight = track_rows(mesh.vertices, mesh.faces, normals, shaped, self.tracks)
             weighted = rows.T @ sparse.diags(weight)
             terms.append(((weighted @ rows).tocsr(), -(weighted @ height)))
+        if self.outline is not None:
+            terms.append(self.outline.terms(mesh))
         metric = large_step_metric(mesh.faces, count, self.settings.smoothness, self.settings.sigma_mm)
         free = np.ones(count, bool)
         free[mesh.faces[held]] = False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -15,12 +15,16 @@ from shared.geometry.surface import Surface, TrackPoints
 from shared.imaging.views import Views
 from shared.rendering.precomputed_transfer import Sizes
 from shared.shape.gauss_newton import HELD, SHAPED, Reflectance, ShapeSettings, ShapeSolver
-from shared.shape.silhouette import ContourSettings, fit_outline
+from shared.shape.occluding_contour import ContourSettings, Outlined, Outlines
+from shared.shape.silhouette import FaceOutline, fit_outline
 
 OUTLINED = ("forehead", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "lips", "chin", "jaw", "ears", "scalp")
 """Segments that may form the outline. The neck bends, and clothes cover it."""
-TRACK_REACH_MM = 6.0
-"""So far around a track point the tracks tell the surface better than an outline does."""
+EDGED = ("cheek_left", "cheek_right", "chin", "jaw")
+"""Segments whose edge before hair, neck or background is a step of colour. Hair falls over the forehead."""
+BARE = ("nose", "cheek_left", "cheek_right")
+TRACK_REACH_MM, KNOWN_MM = 6.0, 0.2
+"""So far around a track point the surface is known as well as the point is, but not better than this."""
 RIM_EDGES = 5
 """Lids' rims, so many edges around the sockets, stay where tracking has laid them: they are thinner than a pixel, and
 shading would crumple them."""
@@ -55,15 +59,24 @@ def surface_error(tracks: TrackPoints | None) -> float:
 def meet_outline(
     views: Views, surface: Surface, settings: ContourSettings, context: RunContext
 ) -> tuple[Surface, dict]:
-    """The surface with its mesh moved to meet the borders of the views' masks where no track lies, and a record."""
+    """The surface with its mesh moved to meet the face's edges in the views and the borders of their masks where tracks
+    do not tell better, and a record."""
     mesh = surface.mesh
-    if surface.tracks is None:
-        known = np.isin(np.arange(len(mesh.vertices)), mesh.faces[surface.faces_of(SHAPED)])
-    else:
-        known = cKDTree(surface.tracks.positions).query(mesh.vertices)[0] < TRACK_REACH_MM
-    fitted, record = fit_outline(mesh, surface.faces_of(OUTLINED), known, views, settings, context)
+    fitted, record = fit_outline(mesh, outlined_of(surface), views, settings, context)
     placed = move_without_crossing(mesh.vertices, fitted.vertices, fitted.faces)
     return surface.with_mesh(fitted.replace(vertices=placed)), record
+
+
+def outlined_of(surface: Surface) -> Outlined:
+    """What of the surface may form an outline, and how well it is known: near track points as well as they are."""
+    mesh = surface.mesh
+    if surface.tracks is None:
+        known_mm = np.where(surface.faces_of(SHAPED), KNOWN_MM, np.inf)
+    else:
+        distance, nearest = cKDTree(surface.tracks.positions).query(mesh.vertices[mesh.faces].mean(1))
+        known_mm = np.maximum(surface.tracks.sigma_mm[nearest], KNOWN_MM)
+        known_mm[distance > TRACK_REACH_MM] = np.inf
+    return Outlined(*(surface.faces_of(names) for names in (OUTLINED, EDGED, BARE)), known_mm)
 
 
 def refine_shape(
@@ -78,7 +91,11 @@ def refine_shape(
 ) -> RefinedSurface:
     """The surface with its mesh refined under a known light; begun: its mesh as it was refined before, with as many
     subdivisions or fewer, from where this goes on."""
-    solver = ShapeSolver(views, surface.tracks, reflectance, appearance, sizes, settings, context)
+    outline = None
+    if settings.contour is not None:
+        outlined = replace(outlined_of(surface), usable=surface.faces_of(EDGED))
+        outline = FaceOutline(outlined, views, Outlines.of(views), settings.contour)
+    solver = ShapeSolver(views, surface.tracks, reflectance, appearance, sizes, settings, context, outline)
     held = surface.faces_of(HELD) | surface.faces_near(("eye_sockets",), RIM_EDGES)
     start, refined = solver.refine(surface.mesh, surface.faces_of(SHAPED), held, begun)
     eyes = np.repeat(surface.faces_of(("eyes",)), len(refined.faces) // len(surface.mesh.faces))
