@@ -1,5 +1,6 @@
 """Pictures and textures as arrays: colour, sampling where a surface point is seen, texels, detail.
 
-Read in this order: color, image_sampling, views, texture, texels, turning_eyes, picture_detail, frame_index.
+Read in this order: material_labels, color, image_sampling, views, texture, texels, turning_eyes, picture_detail,
+frame_index.
 May import: compute, geometry.
 """

@@ -12,6 +12,7 @@ import numpy as np
 
 from shared.geometry.mesh import normalised
 from shared.geometry.transforms import camera_centres, project
+from shared.imaging.material_labels import LABELS
 from shared.imaging.texture import sample_bilinear
 from shared.rendering.envmap import latlong_lookup
 from tools.synthesis.eye_light import eye_irradiance
@@ -53,6 +54,7 @@ def take_picture(surface: SyntheticSurface, light: EnvironmentLight, irradiance:
     """irradiance [size, size, 3] of this shot -> float32 images by name. eyes: how the head's look, if it has living
     ones.
 
+    label [H, W] uint8, where the textures have it: what most rays of the pixel show, UNKNOWN where none hits the head.
     radiance [H, W, 3]; albedo [H, W, 3], normal [H, W, 3] (head space), specular and roughness [H, W]: means over the
     rays that hit the head, 0 where none does; depth (camera z, mm), mask (face skin) and head [H, W]: means over all
     rays.
@@ -73,11 +75,15 @@ def take_picture(surface: SyntheticSurface, light: EnvironmentLight, irradiance:
         values["radiance"] = _shade(surface, light, irradiance, shot, directions, values, samples.part(order, rays),
                                     choice[hit], wet, order)
         column, row = pixels[hit].T
+        if surface.materials.label is not None:
+            votes = total.setdefault("votes", np.zeros((camera.height, camera.width, len(LABELS)), np.uint8))
+            votes[row, column, surface.label(values["points"].uv)] += 1
         total["radiance"][row, column] -= background[row, column]
         for name in ("radiance", "normal", "depth", "mask", "head", *TEXTURES):
             empty = np.zeros((camera.height, camera.width, *values[name].shape[1:]), np.float32)
             total.setdefault(name, empty)[row, column] += values[name]
-    return _averaged(total, rays)
+    votes = total.pop("votes", None)
+    return _averaged(total, rays) | ({} if votes is None else {"label": votes.argmax(-1).astype(np.uint8)})
 
 
 def _averaged(total: dict[str, np.ndarray], rays: int) -> dict[str, np.ndarray]:

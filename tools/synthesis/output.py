@@ -57,9 +57,11 @@ def sensor_codes(radiance: np.ndarray, noise: float, seed: int) -> np.ndarray:
 
 
 def write_buffers(stem: str, images: dict[str, np.ndarray], names: Iterable[str], mantissa_bits: int) -> None:
-    """stem_NAME.exr (half) for radiance and buffers, stem_NAME.png for coverages."""
+    """stem_NAME.exr (half) for radiance and buffers, stem_NAME.png for coverages and labels."""
     for name in names:
-        if name in COVERAGES:
+        if name == "label":
+            write_png(f"{stem}_label.png", images[name])
+        elif name in COVERAGES:
             write_png(f"{stem}_{name}.png", np.uint8(np.round(255 * images[name])))
         else:
             space = "lin_rec709_scene" if name in COLOURS else "data"
@@ -74,13 +76,16 @@ def rounded(values: np.ndarray, mantissa_bits: int) -> np.ndarray:
 
 
 def write_scene_truth(folder: Path, scene: Scene, mesh: Mesh, mantissa_bits: int) -> None:
-    """gt/: mesh.obj (`mesh`: all of the scene's or part of it), the UV textures and the clip's environment."""
+    """gt/: mesh.obj (`mesh`: all of the scene's or part of it), the UV textures, labels where
+    they are known, and the clip's environment."""
     (folder / "frames").mkdir(parents=True, exist_ok=True)
     write_obj(folder / "mesh.obj", mesh)
     for name in ("albedo", "specular", "roughness", "mask"):
         space = "lin_rec709_scene" if name in COLOURS else "data"
         texture = rounded(getattr(scene.materials, name), mantissa_bits)
         write_exr(folder / f"{name}.exr", texture, colour_space=space, half=True)
+    if scene.materials.label is not None:
+        write_png(folder / "label.png", scene.materials.label)
     write_environment(folder / "envmap.exr", scene.lights[0])
     if scene.lamps_at is not None:
         write_lamp(folder / "lamp.json", scene)

@@ -15,6 +15,7 @@ from scipy.ndimage import distance_transform_edt
 
 from shared.capture.landmarks import BROW_LEFT, BROW_RIGHT
 from shared.geometry.mesh import interpolate, normalised, rasterize_uv
+from shared.imaging.material_labels import BROW, CLOTH, EYE, HAIR, LIPS, SKIN, UNKNOWN
 from tools.synthesis.head import Head
 from tools.synthesis.noise import value_noise
 from tools.synthesis.surface import Materials
@@ -27,6 +28,8 @@ COLLAR_Y_MM, COLLAR_SLOPE = -163.0, -0.5
 CLOTH_ALBEDO = (0.07, 0.085, 0.11)
 IRIS_RADIUS_MM = 6.0
 PUPIL_RADIUS_MM = 2.2
+LABEL_MM = 2.0
+"""Standard deviation over which hair counts as covering the skin between its strands."""
 # Amounts added per region: melanin, haemoglobin, specular intensity, roughness.
 REGIONS = {
     "lips": (0.10, 0.75, 0.22, -0.11), "lids": (0.10, 0.16, 0.05, -0.02), "ears": (0.0, 0.32, 0.0, 0.02),
@@ -82,12 +85,13 @@ class SkinPainter:
         """[size, size] smooth random pattern over the surface, mean 0, standard deviation about 1."""
         return value_noise(self.place, wavelength_mm, self._rng).astype(np.float32)
 
-    def paint(self, complexion: Complexion) -> Materials:
-        """All textures."""
+    def paint(self, complexion: Complexion, labelled: bool = False) -> Materials:
+        """All textures; labelled: with labels."""
         melanin, haemoglobin, specular, roughness = self._amounts(complexion)
         absorbed = melanin[..., None] * MELANIN_ABSORPTION + haemoglobin[..., None] * HAEMOGLOBIN_ABSORPTION
         albedo = BARE_SKIN * np.exp(-absorbed)
-        hair = self._hair(complexion)
+        covered, brows = self._hair(complexion)
+        hair = np.clip(np.maximum(covered, brows), 0, 1)
         albedo = albedo * (1 - hair[..., None]) + np.array(complexion.hair_colour) * hair[..., None]
         cloth = self._cloth()
         weave = np.array(CLOTH_ALBEDO) * (1 + 0.12 * self.noise(1.5))[..., None]
@@ -97,7 +101,23 @@ class SkinPainter:
         albedo, specular, roughness = self._eyes(albedo, specular, roughness, complexion)
         mask = self.inside(*MASK_SEGMENTS)
         return Materials(np.clip(albedo, 0.01, 0.9).astype(np.float32), np.clip(specular, 0.1, 1.2).astype(np.float32),
-                         np.clip(roughness, 0.22, 0.7).astype(np.float32), mask.astype(np.float32))
+                         np.clip(roughness, 0.22, 0.7).astype(np.float32), mask.astype(np.float32),
+                         self._labels(covered, brows, cloth) if labelled else None)
+
+    def _labels(self, covered: np.ndarray, brows: np.ndarray, cloth: np.ndarray) -> np.ndarray:
+        """[size, size] uint8 of material_labels.LABELS; hair where it covers half of the surface within LABEL_MM, brows
+        where their strokes are as dense as that of a fifth."""
+        def around(share: np.ndarray) -> np.ndarray:
+            return cv2.GaussianBlur(share.astype(np.float32), (0, 0), max(LABEL_MM * self._texels_per_mm(), 0.5))
+
+        label = np.full((self.size, self.size), SKIN, np.uint8)
+        label[around(np.clip(covered, 0, 1)) > 0.5] = HAIR
+        label[around(brows) > 0.2] = BROW
+        label[self.inside("lips")] = LIPS
+        label[self.inside("inner_mouth", "eye_sockets")] = UNKNOWN
+        label[cloth > 0.5] = CLOTH
+        label[self.inside("eyes")] = EYE
+        return label
 
     def _amounts(self, complexion: Complexion) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Melanin, haemoglobin, specular intensity and roughness of bare skin, each [size, size]."""
@@ -134,14 +154,14 @@ class SkinPainter:
             moles += self._rng.uniform(0.4, 1.1) / (1 + (distance / self._rng.uniform(0.6, 1.3)) ** 6)
         return moles
 
-    def _hair(self, complexion: Complexion) -> np.ndarray:
-        """[size, size] share of the surface that hair covers: brows, cropped hair, stubble."""
+    def _hair(self, complexion: Complexion) -> tuple[np.ndarray, np.ndarray]:
+        """[size, size] shares of the surface that hair covers: cropped hair or stubble, and brows."""
         grain = np.clip(0.93 + 0.12 * self.noise(0.9) + 0.06 * self.noise(5), 0, 1)
         line = np.clip((self.region("scalp", softness_mm=7) - 0.5 + 0.09 * self.noise(2.5)) / 0.35, 0, 1)
         beard = self.region("chin", "jaw", "upper_lip_skin", softness_mm=8) * (1 - self.region("lips", softness_mm=2))
         beard *= np.clip(0.6 + 0.3 * self.noise(12), 0, 1) * np.clip(0.5 + 0.6 * self.noise(1.3), 0, 1)
         cover = complexion.hair * line * grain
-        return np.clip(np.maximum(np.maximum(cover, 0.75 * complexion.stubble * beard), self._brows()), 0, 1)
+        return np.maximum(cover, 0.75 * complexion.stubble * beard), self._brows()
 
     def _cloth(self) -> np.ndarray:
         """[size, size] share of the surface that the shirt covers: all below a plane that rises to the back."""

@@ -4,11 +4,13 @@
     python -m tools.synthesize DEST --scan SUBJECT --light lamp --clipped 0.25
     python -m tools.synthesize DEST --light lamp --lamp-distance 600
     python -m tools.synthesize DEST --eyes living --gaze wander --blinks 1
+    python -m tools.synthesize DEST --hair ears --beard 6 --collar
 
 Writes:  DEST/subject.yaml, capture.json, the clip (video.avi, or frames/%04d.png), synthesis.json (how it was made);
          gt/: mesh.obj, albedo.exr, specular.exr, roughness.exr, mask.exr (UV), envmap.exr, poses.npz, where lamps
-         stand near lamp.json, and for some frames frames/NNNN_*.exr and .png; relight/: the same head under other
-         lights. tools/score.py reads all of it. poses.npz of living eyes: gaze.true_eyes says what else it holds.
+         stand near lamp.json, of heads with hair or a collar label.png (UV), and for some frames frames/NNNN_*.exr and
+         .png; relight/: the same head under other lights. tools/score.py reads all of it but labels. poses.npz of
+         living eyes: gaze.true_eyes says what else it holds.
 Method:  a random head of the head model with procedural skin, bumps and bust, or the scan of another subject; a
          procedural light; direct light with its diffuse bounces and the GGX lobe, traced with embree (irradiance,
          camera); sensor noise, 8-bit sRGB.
@@ -41,6 +43,7 @@ from tools.synthesis.camera import PictureQuality, PinholeCamera
 from tools.synthesis.chart import place_chart
 from tools.synthesis.eyes import LivingEyes, living_head
 from tools.synthesis.gaze import GAZES, HALF_SHUT, eye_motion, true_eyes
+from tools.synthesis.hair import HAIRCUTS, Growth, coloured, grown
 from tools.synthesis.head import PITCH_DEG, YAW_DEG, Head, face_part, head_turn, random_head
 from tools.synthesis.iris import EyePaint, paint_eyes
 from tools.synthesis.irradiance import IrradianceQuality, SyntheticShot
@@ -68,6 +71,9 @@ as sharp as the pictures."""
 LEAST_LAMP_DISTANCE = 300.0
 """mm from the head's origin: nearer, a lamp would stand among hair and shoulders."""
 LIVING = "living"
+DENSE_BEARD = 14.0
+"""Stubble of a beard that hides most of the skin below it."""
+MOST_BEARD_MM = 30.0
 RELIGHT_YAWS_DEG = {"front": 0.0, "left15": -15.0, "right15": 15.0}
 
 
@@ -80,10 +86,11 @@ class SynthesisSettings:
     disk. eyes: open and closed ones are painted and stand still; living ones turn and blink: gaze and gaze_share as in
     gaze.eye_motion, blinks_per_second. face_truth_only: gt/mesh.obj holds the face without the rest of the head.
     chart: a colour chart stands beside the head, and the picture is half as wide again to hold it. specular_scale:
-    factor on the specular intensity; 0: matte. clipped: share of the face's skin on which a channel burns out, over the
-    clip; 0: the light is as bright as FACE_RADIANCE says. lamp_distance_mm: of the lamps of the clip's light from the
-    head's mean place, where they then give the irradiance that they give far away; 0: they are far away. scan: folder
-    of a subject whose ground truth takes the procedural head's place.
+    factor on the specular intensity; 0: matte. growth: hair, beard and collar, whose truth has labels. clipped: share
+    of the face's skin on which a channel burns out, over the clip; 0: the light is as bright as FACE_RADIANCE says.
+    lamp_distance_mm: of the lamps of the clip's light from the head's mean place, where they then give the irradiance
+    that they give far away; 0: they are far away. scan: folder of a subject whose ground truth takes the procedural
+    head's place.
     """
 
     size: int = 400
@@ -111,15 +118,18 @@ class SynthesisSettings:
     gaze: str = "ahead"
     gaze_share: float = 1.0
     blinks_per_second: float = 0.0
+    growth: Growth = Growth()
     irradiance: IrradianceQuality = IrradianceQuality()
     picture: PictureQuality = PictureQuality()
 
     def record(self) -> dict:
-        """For synthesis.json: what living eyes do is left out where there are none."""
+        """For synthesis.json: what living eyes do, and hair, are left out where there are none."""
         values = asdict(self)
         if self.eyes != LIVING:
             for name in ("gaze", "gaze_share", "blinks_per_second"):
                 del values[name]
+        if not self.growth:
+            del values["growth"]
         return values
 
 
@@ -181,7 +191,14 @@ def synthesize(destination: Path, settings: SynthesisSettings, processes: int) -
 def procedural(settings: SynthesisSettings) -> tuple[Mesh, Mesh, Materials]:
     """A random head: its mesh, the part of it that the truth holds, its textures."""
     head = random_head(head_model(settings.level), settings.seed, settings.eyes == "closed")
-    materials = SkinPainter(head, settings.texture, settings.seed).paint(Complexion(tone=settings.tone))
+    growth, complexion = settings.growth, Complexion(tone=settings.tone)
+    if growth:
+        head = grown(head, growth, settings.seed)
+    if growth.beard_mm:
+        complexion = replace(complexion, stubble=DENSE_BEARD)
+    materials = SkinPainter(head, settings.texture, settings.seed).paint(complexion, labelled=bool(growth))
+    if growth:
+        materials = coloured(materials, growth, complexion.hair_colour, settings.seed)
     return head.mesh, face_part(head) if settings.face_truth_only else head.mesh, materials
 
 
@@ -328,6 +345,10 @@ def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
     parser.add_argument("--clipped", type=float, help="share of the face's skin on which a channel burns out")
     parser.add_argument("--lamp-distance", dest="lamp_distance_mm", type=float, metavar="MM",
                         help="the lamps of the clip's light stand so far from the head, mm; 0: far away (default)")
+    parser.add_argument("--hair", choices=HAIRCUTS, help="hair as geometry: cropped, over the ears, or below the jaw; "
+                        "with it, a beard or a collar, the truth has labels")
+    parser.add_argument("--beard", type=float, default=0.0, metavar="MM", help="a beard of that thickness")
+    parser.add_argument("--collar", action="store_true", help="a collar about the neck")
     parser.add_argument("--scan", metavar="SUBJECT",
                         help="subject whose ground truth takes the procedural head's place")
     parser.add_argument("--chart", action="store_true", help="a colour chart beside the head, in a wider picture")
@@ -338,7 +359,8 @@ def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
              ("size", "frames", "seed", "eyes", "tone", "noise", "focal_mm", "yaw_deg", "pitch_deg", "specular_scale",
               "clipped", "lamp_distance_mm", "scan", "gaze", "gaze_share", "blinks_per_second")}
     settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
-    settings = replace(settings, chart=options.chart)
+    settings = replace(settings, chart=options.chart,
+                       growth=Growth(options.hair or "", options.beard, options.collar))
     if options.light:
         others = tuple(name for name in settings.lights if name != options.light)
         settings = replace(settings, lights=(options.light, *others)[:len(settings.lights)])
@@ -361,6 +383,12 @@ def _checked(settings: SynthesisSettings) -> SynthesisSettings:
     if settings.eyes != LIVING and (settings.gaze != "ahead" or settings.blinks_per_second):
         raise InputError("these eyes do not move", where="--gaze or --blinks", got=f"--eyes {settings.eyes}",
                          hint="add --eyes living")
+    if not 0.0 <= settings.growth.beard_mm <= MOST_BEARD_MM:
+        raise InputError("out of range", where="--beard", got=settings.growth.beard_mm,
+                         expected=f"0 to {MOST_BEARD_MM:g} mm")
+    if settings.growth and (settings.scan or settings.eyes == LIVING):
+        raise InputError("grow on the procedural head alone", where="--hair, --beard or --collar",
+                         got="--scan" if settings.scan else f"--eyes {LIVING}", hint="leave out one")
     if settings.scan and settings.eyes != SynthesisSettings.eyes:
         raise InputError("a scan has eyes of its own", where="--scan with --eyes", hint="leave out one")
     if settings.scan and settings.face_truth_only:

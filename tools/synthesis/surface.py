@@ -16,12 +16,14 @@ OFFSET_MM = 0.02
 
 @dataclass(frozen=True)
 class Materials:
-    """UV textures: albedo [H, W, 3], specular intensity, roughness and face skin mask [H, W], all float32."""
+    """UV textures: albedo [H, W, 3], specular intensity, roughness and face skin mask [H, W], all float32; label [H, W]
+    uint8: of material_labels.LABELS, None: not known."""
 
     albedo: np.ndarray
     specular: np.ndarray
     roughness: np.ndarray
     mask: np.ndarray
+    label: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,11 @@ class SyntheticSurface:
     def albedo(self, uv: np.ndarray) -> np.ndarray:
         """[N, 2] -> [N, 3]."""
         return sample_bilinear(self.materials.albedo, uv)
+
+    def label(self, uv: np.ndarray) -> np.ndarray:
+        """[N, 2] -> [N] uint8, of the nearest texel."""
+        label = self.materials.label
+        return label.ravel()[nearest_texel(uv, len(label))]
 
 
 def nearest_texel(uv: np.ndarray, size: int) -> np.ndarray:

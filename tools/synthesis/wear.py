@@ -119,16 +119,23 @@ def with_fringe(head: Head, cover: float, seed: int) -> Head:
 
 def with_beard(head: Head, length_mm: float, seed: int) -> Head:
     """The head with cheeks, chin and upper lip that thick, in tufts."""
-    mesh, rng = head.mesh, np.random.default_rng([seed, 8])
-    inside = np.isin(head.face_segment, [head.segment_names.index(name) for name in BEARD_SEGMENTS])
+    return thickened(head, BEARD_SEGMENTS, ("lips", "inner_mouth", "neck"), length_mm, BEARD_WAVELENGTH_MM,
+                     np.random.default_rng([seed, 8]))
+
+
+def thickened(head: Head, segments: tuple[str, ...], bare: tuple[str, ...], length_mm: float, wavelength_mm: float,
+              rng: np.random.Generator) -> Head:
+    """The head with the named segments that thick, in tufts of that wavelength; those of bare stay as they are."""
+    mesh = head.mesh
+    inside = np.isin(head.face_segment, [head.segment_names.index(name) for name in segments])
     share = np.zeros(len(mesh.vertices))
     np.maximum.at(share, mesh.faces[inside].ravel(), 1.0)
-    bare = np.isin(head.face_segment, [head.segment_names.index(name) for name in ("lips", "inner_mouth", "neck")])
-    share[np.unique(mesh.faces[bare])] = 0.0
+    kept = np.isin(head.face_segment, [head.segment_names.index(name) for name in bare])
+    share[np.unique(mesh.faces[kept])] = 0.0
     adjacency = vertex_adjacency(mesh.faces, len(share))
     for _ in range(3):
         share = np.minimum(share, adjacency @ share / np.maximum(adjacency.sum(1).A1, 1.0))
-    tufts = 0.75 + 0.25 * np.clip(value_noise(mesh.vertices, BEARD_WAVELENGTH_MM, rng), -1, 1)
+    tufts = 0.75 + 0.25 * np.clip(value_noise(mesh.vertices, wavelength_mm, rng), -1, 1)
     moved = mesh.vertices + (length_mm * share * tufts)[:, None] * vertex_normals(mesh.vertices, mesh.faces)
     return replace(head, mesh=mesh.replace(vertices=moved))
 
