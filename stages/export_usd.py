@@ -26,7 +26,7 @@ from shared.errors import LimnError
 
 STAGE = Stage(
     name="export_usd",
-    version=9,
+    version=10,
     help="The head as USD, glTF, OBJ and EXR, with a report to judge it by.",
     inputs=("sample_frames", "track_landmarks", "init_albedo", "inverse_render"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -87,10 +87,12 @@ def read_maps(folder: Path) -> dict:
 
     from shared.io.export_maps import SOLVED_MAPS
     from shared.io.images import read_exr
+    from shared.io.material_maps import read_material
     from shared.io.usd_material import modulated_ior
 
     maps = {name: read_exr(folder / f"{name}.exr") for name in SOLVED_MAPS}
     maps["confidence"] = np.clip(maps["confidence"], 0.0, 1.0)
+    maps["material"] = read_material(folder / "material.exr")
     return maps | {"specular_ior": modulated_ior(maps["specular_intensity"])}
 
 

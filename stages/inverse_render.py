@@ -21,6 +21,8 @@ Method   What no track reaches (ears, skull, jaw) moves until the mesh's outline
          Several clips of one head under different lights are solved as one (shared/inverse/joint_clips.py): one mesh
          and one set of maps, a light and poses of each. What lies at the top is the first clip's then, and clips/ holds
          the rest.
+         Last, each texel gets probabilities of what it shows, skin, hair, cloth and others: a mixture model of how it
+         looks beside typical skin (shared/appearance/material_mixture.py). Nothing else depends on them yet.
 Fails    poses that match no frame; too little of the face seen; results that are not finite.
 """
 
@@ -71,7 +73,7 @@ STAGE = Stage(
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
     outputs=(
-        Output("maps/*.exr", "albedo, specular intensity, roughness, normal, confidence", space="uv",
+        Output("maps/*.exr", "albedo, specular intensity, roughness, normal, confidence, material", space="uv",
                colour_space="in each file"),
         Output("envmap.exr", "incident radiance, lat-long", space="world", colour_space="lin_rec709_scene"),
         Output("envmap_far.exr", "the same without the main lamp, where that stands near", space="world",
@@ -174,6 +176,17 @@ def write_maps(job: Job, result) -> None:
         colour_space = "lin_rec709_scene" if name == "diffuse_albedo" else "data"
         attributes = {"content": FLAT_NORMALS} if name == "normal" and not result.record.get("relief") else {}
         write_exr(job.out / "maps" / f"{name}.exr", image, colour_space=colour_space, attributes=attributes)
+
+
+def write_material_map(job: Job, surface, result) -> None:
+    """maps/material.exr; surface: as it was tracked, with its segments."""
+    from shared.compute.run_context import RunContext
+    from shared.inverse.material_map import material_map
+    from shared.io.material_maps import write_material
+
+    context = RunContext(job.progress, job.note)
+    probabilities = material_map(result, surface, len(result.maps["confidence"]), context)
+    write_material(job.out / "maps" / "material.exr", probabilities, half=True, attributes={"content": "material"})
 
 
 def write_light(folder: Path, light, result) -> None:
@@ -303,6 +316,7 @@ def run(job: Job) -> None:
     for text in record["warnings"]:
         job.warn(text)
     write_maps(job, result)
+    write_material_map(job, surface, result)
     write_shape(job, surface, result.viewer.mesh)
     lights, own = np.split(result.solution.state.light, len(clips)), []
     for k, (clip, rows) in enumerate(zip(clips, views.frames_of_lights, strict=True)):
@@ -321,10 +335,11 @@ def check(job: Job) -> None:
     from shared.appearance.projection import SPECULAR_RANGE
     from shared.inverse.solve import LEAST_SEEN_SHARE
     from shared.io.arrays import read_json
+    from shared.io.export_maps import SOLVED_MAPS, read_map
     from shared.io.images import read_exr
 
-    maps = {path.stem: read_exr(path) for path in sorted((job.out / "maps").glob("*.exr"))}
-    for name, image in maps.items():
+    for name in (*SOLVED_MAPS, "material"):
+        image = read_map(job.out / "maps" / f"{name}.exr", name)
         highest = SPECULAR_RANGE[1] if name == "specular_intensity" else 1.0
         if not (image.min() >= 0.0 and image.max() <= highest):
             raise LimnError(f"{name} leaves [0, {highest:g}]: {image.min():.3f} .. {image.max():.3f}")

@@ -18,7 +18,7 @@ from pxr import Tf, UsdUtils
 from shared.errors import InputError, LimnError
 from shared.geometry.mesh_checks import mesh_errors, uv_overlap
 from shared.io.arrays import load_arrays
-from shared.io.export_maps import MAPS, map_errors, map_file
+from shared.io.export_maps import MAPS, map_errors, map_file, read_map
 from shared.io.exr_checks import header_errors, header_gaps
 from shared.io.exr_header import check_decodable
 from shared.io.gltf_validate import glb_errors
@@ -172,7 +172,7 @@ class _Checks:
 
     def map(self, file: str, name: str) -> list[str]:
         """Shape and values of one map."""
-        values = read_exr(self.folder / file)
+        values = read_map(self.folder / file, name)
         self.sizes[file] = values.shape[1], values.shape[0]
         return map_errors(name, values)
 

@@ -10,20 +10,22 @@ import cv2
 import numpy as np
 
 from shared.imaging.color import encode_srgb
-from shared.io.images import write_exr, write_png
+from shared.io.images import read_exr, write_exr, write_png
+from shared.io.material_maps import material_errors, read_material, write_material
 
-# name -> (colour or data, what one unit is)
+# name -> (colour, data or materials, what one unit is)
 MAPS = {
     "diffuse_albedo": ("colour", "share of light scattered back, per channel"),
     "specular_intensity": ("data", "multiple of the Fresnel reflection with F0 = 0.04"),
     "roughness": ("data", "square root of GGX alpha"),
     "normal": ("data", "tangent space, n * 0.5 + 0.5"),
     "confidence": ("data", "0 to 1: how well the clip determines the texel"),
+    "material": ("materials", "0 to 1: probability of each material; Y: number of the likeliest"),
     "specular_ior": ("data", "index of refraction that shows the specular intensity, for UsdPreviewSurface"),
 }
-SOLVED_MAPS = tuple(name for name in MAPS if name != "specular_ior")
-"""Those that inverse_render makes; specular_ior follows from specular_intensity."""
-_UP_TO_ONE = ("diffuse_albedo", "confidence", "normal", "roughness")
+SOLVED_MAPS = tuple(name for name in MAPS if name not in ("material", "specular_ior"))
+"""Those that inverse_render solves; specular_ior follows from specular_intensity, material tells them apart."""
+_UP_TO_ONE = ("diffuse_albedo", "confidence", "normal", "roughness", "material")
 UDIM_TILE = 1001
 WORKING_SPACE, ACESCG = "lin_rec709_scene", "lin_ap1_scene"
 
@@ -77,8 +79,13 @@ class MapWriter:
         self._write(path, converted, self.colour_space, {"unit": unit, **extra}, latlong=latlong)
 
     def write_map(self, folder: Path, name: str, values: np.ndarray) -> None:
-        """A map named as in MAPS, values [H, W] or [H, W, 3], into folder."""
+        """A map named as in MAPS, values [H, W], [H, W, 3] or of materials [H, W, len(LABELS)], into folder. The last
+        always is in lines, without mipmaps: numbers of materials have no mean."""
         kind, unit = MAPS[name]
+        if kind == "materials":
+            attributes = {**self.attributes, "unit": unit, "content": name}
+            write_material(folder / self.file_name(name), values, self.half, attributes)
+            return
         is_colour = kind == "colour"
         converted = acescg_from_rec709(values) if is_colour and self.acescg else values
         space = self.colour_space if is_colour else "data"
@@ -95,6 +102,11 @@ class MapWriter:
         attributes = {**self.attributes, **attributes}
         write_exr(path, values, colour_space=colour_space, half=self.half, attributes=attributes, latlong=latlong,
                   layout=layout)
+
+
+def read_map(path: Path, name: str) -> np.ndarray:
+    """A map named as in MAPS, as stored: float32 [H, W], [H, W, 3] or of materials [H, W, len(LABELS)]. InputError."""
+    return read_material(path) if name == "material" else read_exr(path)
 
 
 def integer_codes(name: str, values: np.ndarray, bits: int) -> np.ndarray:
@@ -129,7 +141,7 @@ def paste_crop(crop: np.ndarray, placement: tuple[float, float, float], size: tu
 
 
 def map_errors(name: str, values: np.ndarray) -> list[str]:
-    """Sentences about a map's shape and range. values [H, W] or [H, W, 3]."""
+    """Sentences about a map's shape and range. values [H, W], [H, W, 3] or of materials [H, W, len(LABELS)]."""
     height, width = values.shape[:2]
     errors = []
     if height != width or width & (width - 1):
@@ -141,4 +153,4 @@ def map_errors(name: str, values: np.ndarray) -> list[str]:
         errors.append(f"values down to {values.min():.4g}, expected at least {lowest:.0f}")
     if name in _UP_TO_ONE and values.max() > 1.0 + 1e-3:
         errors.append(f"values up to {values.max():.4g}, expected at most 1")
-    return errors
+    return errors + (material_errors(values) if name == "material" else [])

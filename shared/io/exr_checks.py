@@ -9,6 +9,7 @@ from __future__ import annotations
 from shared.io.export_maps import MAPS
 from shared.io.exr_header import ExrPart
 from shared.io.images import CHROMATICITIES, COLOUR_SPACES
+from shared.io.material_maps import CHANNELS
 
 UNIT, CONTENT, SPACE, PRIMARIES = "limn:unit", "limn:content", "colorInteropID", "chromaticities"
 _ENVMAP, _LATLONG = "envmap", 0
@@ -41,8 +42,8 @@ def header_gaps(part: ExrPart, map_name: str = "", latlong: bool = False) -> lis
 
 def _channel_errors(part: ExrPart, map_name: str) -> list[str]:
     names = {channel.name for channel in part.channels}
-    single = map_name in MAPS and MAPS[map_name][0] == "data" and map_name != "normal"
-    expected = "Y" if single else "RGB"
+    kind = MAPS[map_name][0] if map_name in MAPS else ""
+    expected = CHANNELS if kind == "materials" else "Y" if kind == "data" and map_name != "normal" else "RGB"
     errors = []
     if names != set(expected):
         errors.append(f"channels {', '.join(sorted(names))}, expected {', '.join(expected)}")
@@ -57,7 +58,7 @@ def _colour_errors(part: ExrPart, map_name: str) -> list[str]:
     space, primaries = part.values[SPACE], part.values.get(PRIMARIES)
     if space not in COLOUR_SPACES:
         return [f"states the colour space {space} ({SPACE}), expected one of {', '.join(COLOUR_SPACES)}"]
-    is_data = map_name in MAPS and MAPS[map_name][0] == "data"
+    is_data = map_name in MAPS and MAPS[map_name][0] != "colour"
     if (space == "data") != is_data:
         return [f"states the colour space {space} ({SPACE}), but holds {'data' if is_data else 'colours'}"]
     expected = CHROMATICITIES.get(space, ())

@@ -6,6 +6,7 @@ write_exr alone talks to it, with contiguous arrays only, and reads the file bac
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -37,35 +38,44 @@ def write_exr(
     attributes: dict[str, str | int | float] | None = None,
     latlong: bool = False,
     layout: str = "scanline",
+    channels: Sequence[str] = (),
 ) -> None:
-    """Writes array [H, W] (channel Y) or [H, W, 3] (RGB) as a ZIP-compressed EXR.
+    """Writes array [H, W] (channel Y), [H, W, 3] (RGB) or [H, W, C] with C named channels as a ZIP-compressed EXR.
 
     colour_space: one of COLOUR_SPACES ("data": no colour). half: 16-bit floats, clamped to +-65504. attributes are
     stored as "limn:<name>". latlong marks an environment map. layout: one of LAYOUTS; mipmap halves the picture down to
-    one pixel by box filter, in tiles. Errors: LimnError for a wrong shape, for values that are not finite, or when the
-    file does not read back as written.
+    one pixel by box filter, in tiles. channels: [C] names; such a picture has no mipmaps. Errors: LimnError for a wrong
+    shape, for values that are not finite, or when the file does not read back as written.
     """
     array = np.asarray(array)
-    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:
-        raise LimnError(f"{path}: an EXR is [H, W] or [H, W, 3], got {array.shape}")
+    depth = len(channels) or 3
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != depth) or array.size == 0:
+        raise LimnError(f"{path}: an EXR is [H, W] or [H, W, {depth}], got {array.shape}")
     if not np.isfinite(array).all():
         raise LimnError(f"{path}: {np.count_nonzero(~np.isfinite(array))} values are not finite")
     if half:
         array = np.clip(array, -HALF_MAXIMUM, HALF_MAXIMUM)
     pixels = np.ascontiguousarray(array, np.float16 if half else np.float32)
     header = _header(colour_space, attributes or {}, latlong)
-    if layout not in LAYOUTS or (layout == "mipmap" and latlong):
+    if layout not in LAYOUTS or (layout == "mipmap" and (latlong or channels)):
         raise LimnError(f"{path}: no layout {layout!r} for this picture; known: {', '.join(LAYOUTS)}")
     if layout == "mipmap":
         _write_mipmaps(path, pixels, header)
     else:
         if layout == "tiled":
             header |= {"type": OpenEXR.tiledimage, "tiles": _one_level()}
-        with OpenEXR.File(header, {_channel(pixels): pixels}) as file:
+        with OpenEXR.File(header, _planes(pixels, channels)) as file:
             file.write(str(path))
     with OpenEXR.File(str(path)) as file:
-        if not np.array_equal(file.channels()[_channel(pixels)].pixels, pixels):
-            raise LimnError(f"{path}: the file does not read back as written")
+        for name, plane in _planes(pixels, channels).items():
+            if not np.array_equal(file.channels()[name].pixels, plane):
+                raise LimnError(f"{path}: the file does not read back as written")
+
+
+def _planes(pixels: np.ndarray, channels: Sequence[str]) -> dict[str, np.ndarray]:
+    if not channels:
+        return {_channel(pixels): pixels}
+    return {name: np.ascontiguousarray(pixels[..., k]) for k, name in enumerate(channels)}
 
 
 def _one_level() -> OpenEXR.TileDescription:
@@ -122,14 +132,7 @@ def read_exr(path: Path | str) -> np.ndarray:
     """-> float32 [H, W] or [H, W, 3], values as stored. InputError when the file is missing, truncated, larger than any
     picture once decoded, or not an EXR of that kind.
     """
-    check_decodable(path, LARGEST_MAP)
-    try:
-        with OpenEXR.File(str(path)) as file:
-            if not file.parts:
-                raise InputError("truncated or empty EXR", where=str(path))
-            channels = {name: channel.pixels for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError, TypeError, MemoryError) as error:
-        raise InputError("not a readable EXR", where=str(path), got=error) from error
+    channels = _stored(path)
     colour = next((channels[name] for name in ("RGB", "RGBA") if name in channels), None)
     if colour is None and all(name in channels for name in "RGB") and len({channels[c].shape for c in "RGB"}) == 1:
         colour = np.stack([channels[name] for name in "RGB"], axis=-1)
@@ -139,6 +142,22 @@ def read_exr(path: Path | str) -> np.ndarray:
         raise InputError("an EXR of other channels", where=str(path), got=", ".join(sorted(channels)) or "none",
                          expected="R, G, B or one channel")
     return (colour if colour.ndim == 2 else colour[..., :3]).astype(np.float32)
+
+
+def read_channels(path: Path | str) -> dict[str, np.ndarray]:
+    """{name: float32 [H, W]} of an EXR with channels of other names than R, G, B. Errors: as of read_exr."""
+    return {name: plane.astype(np.float32) for name, plane in _stored(path).items()}
+
+
+def _stored(path: Path | str) -> dict[str, np.ndarray]:
+    check_decodable(path, LARGEST_MAP)
+    try:
+        with OpenEXR.File(str(path)) as file:
+            if not file.parts:
+                raise InputError("truncated or empty EXR", where=str(path))
+            return {name: channel.pixels for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError, TypeError, MemoryError) as error:
+        raise InputError("not a readable EXR", where=str(path), got=error) from error
 
 
 def exr_size(path: Path | str) -> tuple[int, int]:

@@ -170,7 +170,7 @@ def result_content(result: ReportInputs, frame_count: int) -> ReportContent:
         facts=_facts(frames, float(poses["intrinsics"][0, 0])),
         numbers=_numbers(angles, len(excluded), record),
         frames=compared_frames(frames, solved / "renders", chosen, held_out, again, _eyes_in(result, chosen)),
-        maps={name: result.maps[name] for name in SOLVED_MAPS},
+        maps={name: result.maps[name] for name in (*SOLVED_MAPS, "material")},
         envmap=result.envmap,
         views=result.views,
         relit_eyes=_eyes_seen_by(result.views.relit_camera, result.eyes) if result.views and result.eyes else None,

@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from shared.io.material_maps import LABEL_WORDS, label_picture
 from shared.rendering.studio_lights import STUDIO_LIGHTS
 from shared.rendering.view_set import NOVEL_VIEWS, ViewSet
 from shared.report.advice import advice
@@ -41,6 +42,7 @@ _MAP_TEXTS = {
     "roughness": ("Roughness", "black 0 (mirror), white 1 (matt)"),
     "normal": ("Normal", "fine relief in tangent space; even blue is flat"),
     "confidence": ("Confidence", "how well the clip determines each texel; purple 0, yellow 1"),
+    "material": ("Material", "the likeliest: " + ", ".join(f"{name} {colour}" for name, colour in LABEL_WORDS.items())),
 }
 _CHART = (
     "The colour chart as found; the middle of each patch shows the colour that it should have in the light on the "
@@ -149,7 +151,7 @@ def relit_eyes(views: ViewSet | None, rectangle: tuple[int, int, int, int] | Non
 
 
 def map_picture(name: str, values: np.ndarray) -> Figure:
-    """A map, values [S, S] or [S, S, 3], with what its colours mean."""
+    """A map, values [S, S], [S, S, 3] or of materials [S, S, len(LABELS)], with what its colours mean."""
     title, text = _MAP_TEXTS.get(name, (name, ""))
     codes, high = map_bytes(name, shrunk(np.asarray(values, np.float32), MAP_PIXELS))
     height, width = values.shape[:2]
@@ -157,9 +159,12 @@ def map_picture(name: str, values: np.ndarray) -> Figure:
 
 
 def map_bytes(name: str, values: np.ndarray) -> tuple[np.ndarray, float]:
-    """-> uint8 picture of a map, values [S, S] or [S, S, 3], and the value that is shown as white."""
+    """-> uint8 picture of a map, values [S, S], [S, S, 3] or of materials [S, S, len(LABELS)], and the value that is
+    shown as white."""
     if name == "confidence":
         return viridis_bytes(values, 0.0, 1.0), 1.0
+    if name == "material":
+        return label_picture(values), 1.0
     if name == "normal":
         return (np.clip(values, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8), 1.0
     if values.ndim == 3:

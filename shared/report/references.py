@@ -32,6 +32,9 @@ REFERENCES = {
     "Collins2014":
         "Collins, Bartoli, Infinitesimal Plane-Based Pose Estimation. International Journal of Computer Vision 109, "
         "2014.",
+    "Dempster1977":
+        "Dempster, Laird, Rubin, Maximum Likelihood from Incomplete Data via the EM Algorithm. Journal of the Royal "
+        "Statistical Society B 39, 1977.",
     "Duff2017":
         "Duff et al., Building an Orthonormal Basis, Revisited. Journal of Computer Graphics Techniques 6, 2017.",
     "Dupuy2023": "Dupuy, Benyoub, Sampling Visible GGX Normals with Spherical Caps. Computer Graphics Forum 42, 2023.",
@@ -67,6 +70,8 @@ REFERENCES = {
     "Kaufman1975":
         "Kaufman, A variable projection method for solving separable nonlinear least squares problems. BIT 15, 1975.",
     "Kish1965": "Kish, Survey Sampling. Wiley 1965.",
+    "Krahenbuhl2011":
+        "Krahenbuhl, Koltun, Efficient Inference in Fully Connected CRFs with Gaussian Edge Potentials. NIPS 2011.",
     "Kroeger2016": "Kroeger et al., Fast Optical Flow using Dense Inverse Search. ECCV 2016.",
     "Laine2020": "Laine et al., Modular Primitives for High-Performance Differentiable Rendering. SIGGRAPH Asia 2020.",
     "Lam1985": "Lam, Metamerism and Colour Constancy. PhD thesis, University of Bradford, 1985.",

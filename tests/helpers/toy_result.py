@@ -12,8 +12,10 @@ from shapes import sphere, turned
 from shared.contract.job import Parameters
 from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface
+from shared.imaging.material_labels import LABELS
 from shared.io.arrays import save_arrays, write_json
 from shared.io.images import write_exr, write_png
+from shared.io.material_maps import write_material
 from shared.io.meshes import save_mesh
 from stages.export_usd import STAGE
 
@@ -77,6 +79,12 @@ def toy_maps() -> dict[str, np.ndarray]:
     }
 
 
+def toy_material() -> np.ndarray:
+    """[MAP_SIZE, MAP_SIZE, len(LABELS)] probabilities of materials, each the likeliest somewhere."""
+    raised = np.random.default_rng(9).uniform(0.0, 1.0, (MAP_SIZE, MAP_SIZE, len(LABELS))) ** 4
+    return (raised / raised.sum(2, keepdims=True)).astype(np.float32)
+
+
 def write_toy_work(work: Path, moves: str = "head", eyes: bool = False) -> Path:
     """Writes work/<stage>/ of all stages before the export; eyes: of the mesh that has some, and their gaze. ->
     work."""
@@ -126,6 +134,7 @@ def _write_solution(folder: Path) -> None:
     for name, values in toy_maps().items():
         space = "lin_rec709_scene" if name == "diffuse_albedo" else "data"
         write_exr(folder / "maps" / f"{name}.exr", values, colour_space=space)
+    write_material(folder / "maps" / "material.exr", toy_material(), half=True, attributes={})
     radiance = np.random.default_rng(7).uniform(0.1, 3.0, (8, 16, 3))
     write_exr(folder / "envmap.exr", radiance, colour_space="lin_rec709_scene", latlong=True)
     save_mesh(folder / "mesh.npz", toy_mesh())

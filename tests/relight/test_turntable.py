@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from toy_export import write_toy_export
 
+from shared.imaging.material_labels import CLOTH, LABELS
 from shared.io.arrays import read_json
 from shared.io.images import read_png
+from shared.io.material_maps import LABEL_COLOURS
 from tools.limn import main
 from tools.relight import turntable
 from tools.relight.map_sheet import LABEL_PX, TILE_PX, map_sheet
@@ -48,7 +50,7 @@ def test_two_videos_and_a_sheet(original):
     heads, lights = (frames_of(original / "turntable" / name) for name in (HEAD, LIGHT))
     assert [frame.shape for frame in heads] == [(64, 192, 3)] * 3
     assert [frame.shape for frame in lights] == [(64, 64, 3)] * 3
-    assert read_png(original / "turntable" / SHEET).shape == (2 * (TILE_PX + LABEL_PX), 3 * TILE_PX, 3)
+    assert read_png(original / "turntable" / SHEET).shape == (2 * (TILE_PX + LABEL_PX), 4 * TILE_PX, 3)
     data = (original / "turntable" / HEAD).read_bytes()
     assert data.index(b"moov") < data.index(b"mdat"), "browsers would wait for the end"
 
@@ -143,10 +145,12 @@ def test_a_folder_of_another_name_gets_its_own(tmp_path):
 
 def test_sheet_shows_values_as_the_labels_say():
     maps = {"diffuse_albedo": np.full((8, 8, 3), 0.2158605), "roughness": np.full((8, 8), 0.25),
-            "specular_intensity": np.tile([0.2, 1.2], (8, 4)), "normal": np.full((8, 8, 3), [0.5, 0.5, 1.0])}
+            "specular_intensity": np.tile([0.2, 1.2], (8, 4)), "normal": np.full((8, 8, 3), [0.5, 0.5, 1.0]),
+            "material": np.eye(len(LABELS))[np.full((8, 8), CLOTH)]}
     sheet = map_sheet({name: values.astype(np.float32) for name, values in maps.items()})
     middles = sheet[LABEL_PX + TILE_PX // 2::TILE_PX + LABEL_PX, 10::TILE_PX]
-    assert middles[0].tolist() == [[128, 128, 128], [0, 0, 0], [64, 64, 64]]  # albedo, intensity's least, roughness
-    assert middles[1, 0].tolist() == [128, 128, 255]
+    # Albedo, intensity's least, roughness, normal; then cloth.
+    assert middles[0].tolist() == [[128, 128, 128], [0, 0, 0], [64, 64, 64], [128, 128, 255]]
+    assert middles[1, 0].tolist() == LABEL_COLOURS[CLOTH].tolist()
     assert sheet[LABEL_PX + 5, TILE_PX + 70].tolist() == [255, 255, 255]
     assert (sheet[:LABEL_PX, :TILE_PX] > 100).any(), "no label"

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 
 from shared.io.export_maps import MAPS
+from shared.io.material_maps import label_picture
 from shared.report.pictures import grey_bytes, srgb_bytes, viridis_bytes
 
-COLUMNS, TILE_PX, LABEL_PX = 3, 512, 28
+COLUMNS, TILE_PX, LABEL_PX = 4, 512, 28
 _INK, _GROUND = (230, 230, 230), 24
 _FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.5
 _COLOUR_MAPPED = ("confidence",)
@@ -18,8 +19,9 @@ _FROM_0_TO_1 = ("confidence", "roughness")
 
 
 def map_sheet(maps: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Maps named as in export_maps.MAPS, [S, S] or [S, S, 3] linear -> uint8 [H, W, 3] RGB, COLUMNS tiles a row in the
-    order of MAPS. Colours are sRGB-coded, data is linear between the ends that the label states."""
+    """Maps named as in export_maps.MAPS, [S, S] or [S, S, 3] linear, of materials [S, S, len(LABELS)] -> uint8
+    [H, W, 3] RGB, COLUMNS tiles a row in the order of MAPS. Colours are sRGB-coded, data is linear between the ends
+    that the label states."""
     tiles = [_tile(name, maps[name]) for name in MAPS if name in maps]
     tiles += [np.full_like(tiles[0], _GROUND)] * (-len(tiles) % COLUMNS)
     return np.vstack([np.hstack(tiles[k:k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)])
@@ -31,6 +33,8 @@ def _tile(name: str, values: np.ndarray) -> np.ndarray:
     label = name.replace("_", " ")
     if MAPS[name][0] == "colour":
         picture = srgb_bytes(small)
+    elif name == "material":
+        picture = label_picture(small)
     elif small.ndim == 3:
         picture = (np.clip(small, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
     else:

@@ -21,6 +21,7 @@ from shared.io.arrays import read_json, write_json
 from shared.io.export_maps import MAPS
 from shared.io.exr_picture import read_rec709
 from shared.io.images import write_png
+from shared.io.material_maps import read_material
 from shared.rendering.precomputed_transfer import Sizes
 from shared.rendering.studio_lights import studio_light
 from shared.rendering.views import HeadViews, ViewCamera, light_in_head_space, orbit_camera
@@ -127,7 +128,7 @@ def _write_sheet(path: Path, export: Path, asset: Asset, views: HeadViews | None
     maps = {}
     for file in sorted((export / "maps").glob("*.exr")):
         if (name := file.name.partition(".")[0]) in MAPS:
-            maps[name] = read_rec709(file)
+            maps[name] = read_material(file) if name == "material" else read_rec709(file)
     write_png(path, map_sheet(maps))
 
 
