@@ -1,6 +1,6 @@
 """Scores of a result against a subject's truth.
 
-Read in this order: align, buffers, measures, rotations, gaze, lid_margins, table, score, shadows,
+Read in this order: align, buffers, measures, rotations, gaze, lid_margins, labels, table, score, shadows,
 appearance_errors, held_out.
 May import: shared.
 """

@@ -13,7 +13,8 @@ Measures: geometry_mm    distance of the true face's points to the result's surf
          rerender, relight   sRGB-coded PSNR on the face skin, raw and with one gain per channel
          gaze, rerender_eyes where the truth has living eyes: degrees between directions, blinks found, and the PSNR on
                          eyes and lids, of which held_out are frames that the solver did not see
-         lid_margins_mm  with them: between the borders of what lids leave open, as the camera sees them
+         labels          where the truth has labels: intersection over union of skin, hair, cloth and others
+         lid_margins_mm  with living eyes: between the borders of what lids leave open, as the camera sees them
 Frames:  the result's head frame and scale may be any; it is aligned by a similarity transform (camera centres first,
          then trimmed ICP on the face).
 """
@@ -39,7 +40,7 @@ from shared.imaging.color import decode_srgb
 from shared.io.arrays import load_arrays, read_json, write_json
 from shared.io.images import read_exr, read_png
 from shared.io.meshes import load_mesh, read_obj
-from tools.scoring import align, gaze, lid_margins, measures
+from tools.scoring import align, gaze, labels, lid_margins, measures
 from tools.scoring.buffers import BufferRenderer
 from tools.scoring.table import table
 
@@ -102,6 +103,9 @@ def score(
     scores |= score_appearance(subject, result, chosen, alignment.rotation, rng)
     if "gaze" in truth:
         scores |= score_eyes(subject, export, truth, alignment.rotation)
+    if labels.label_files(subject / "gt" / "frames") and (export / "maps" / "material.exr").exists():
+        scores["labels"] = labels.label_scores(subject / "gt" / "frames", export, result.mesh, result.poses,
+                                               result.intrinsics)
     scores |= score_light(subject, export)
     return {"subject": subject.resolve().name, "result": str(export), **scores}
 

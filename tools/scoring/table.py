@@ -23,7 +23,7 @@ ALBEDO_NAMES = {"aligned": "aligned  ", "aligned_one_gain": "one gain ", "raw": 
 
 def table(scores: dict) -> str:
     """What tools.scoring.score.score returns -> text, one measure a line."""
-    lines = _shape_lines(scores) + _appearance_lines(scores) + _eye_lines(scores)
+    lines = _shape_lines(scores) + _appearance_lines(scores) + _label_lines(scores) + _eye_lines(scores)
     width = max(len(name) for name, _ in lines)
     return "\n".join(f"{name:{width}s}  {text}" for name, text in lines)
 
@@ -52,6 +52,17 @@ def _appearance_lines(scores: dict) -> list[tuple[str, str]]:
     if "rerender" in scores:
         lines.append(("re-render", GAINS.format(**scores["rerender"])))
     return lines + [(f"relight {light}", GAINS.format(**value)) for light, value in scores.get("relight", {}).items()]
+
+
+def _label_lines(scores: dict) -> list[tuple[str, str]]:
+    """Intersection over union by label."""
+    if "labels" not in scores:
+        return []
+    own = scores["labels"]
+    rows = [(f"labels, {where}", ", ".join(f"{name} {value:.3f}" for name, value in own[where].items()))
+            for where in ("texels", "pixels")]
+    covered = ", ".join(f"{name} {value:.1%}" for name, value in own["covered"].items())
+    return [*rows, ("labels", f"{own['unknown']:.1%} of the texels unknown; pixels that the mesh covers: {covered}")]
 
 
 def _eye_lines(scores: dict) -> list[tuple[str, str]]:
