@@ -25,17 +25,18 @@ SEEDS = ("nose", "cheek_left", "cheek_right", "forehead")
 """Mostly skin: where its distribution starts, at those of their vertices that look most alike."""
 PRIORS = {
     "forehead": (0.9, 0.1, 0.0), "brows": (0.3, 0.7, 0.0), "lids": (0.9, 0.1, 0.0), "nose": (0.999, 0.001, 0.0),
-    "cheek_left": (0.93, 0.07, 0.0), "cheek_right": (0.93, 0.07, 0.0), "upper_lip_skin": (0.75, 0.25, 0.0),
-    "lips": (0.97, 0.03, 0.0), "chin": (0.7, 0.3, 0.0), "jaw": (0.65, 0.35, 0.0), "ears": (0.7, 0.3, 0.0),
-    "neck": (0.55, 0.25, 0.2), "scalp": (0.3, 0.7, 0.0), "eyes": (1.0, 0.0, 0.0), "inner_mouth": (1.0, 0.0, 0.0),
+    "cheek_left": (0.96, 0.04, 0.0), "cheek_right": (0.96, 0.04, 0.0), "upper_lip_skin": (0.75, 0.25, 0.0),
+    "lips": (0.97, 0.03, 0.0), "chin": (0.7, 0.3, 0.0), "jaw": (0.75, 0.25, 0.0), "ears": (0.75, 0.25, 0.0),
+    "neck": (0.65, 0.2, 0.15), "scalp": (0.3, 0.7, 0.0), "eyes": (1.0, 0.0, 0.0), "inner_mouth": (1.0, 0.0, 0.0),
     "eye_sockets": (1.0, 0.0, 0.0),
 }
 """Skin, hair, cloth by segment, before the clip is looked at."""
 PRIOR_MM, BROW_MM, LIP_MM = 12.0, 3.0, 2.0
 """Over which the borders of segments are uncertain, and those of brows and lips."""
 CLOTH_BELOW_MM = (15.0, 45.0)
-"""Below the chin: where cloth may begin, and where it is as likely as the table says or more."""
-LOWEST_CLOTH = 0.6
+"""Below the chin: where cloth may begin, and where it is as likely as it gets."""
+LOWEST_CLOTH, LEAST_CLOTH = 0.6, 0.02
+"""Its probability down there, and what is left of the table's above."""
 FLOOR = np.array([0.22, 0.07, 0.07, 0.32, 0.45])
 """Least standard deviations of brightness, two differences of channels, texture and misfit."""
 SKIN_SHARES = (0.5, 0.2, 0.1, 0.2)
@@ -45,18 +46,27 @@ SKIN_FACTORS = ((1.0,) * 5, (1.6,) * 5, (1.3,) * 5, (5.0, 1.5, 1.5, 1.3, 2.0))
 HAIR_START = (np.array([-0.9, 0.1, 0.1, 0.9, 1.2]), np.array([0.7, 0.25, 0.25, 0.8, 1.3]))
 CLOTH_START = (np.array([-0.5, 0.0, 0.0, 0.3, 0.8]), np.array([1.0, 0.5, 0.5, 0.9, 1.5]))
 """Beside skin: means and standard deviations of any hair and of any cloth."""
-COMPONENTS, ANY = 3, 0.1
-"""Normal distributions that a material is a mixture of, and what share of any."""
+BRIGHTER = (-0.5, 0.0, 0.6)
+"""By how much the distributions that hair and cloth are mixtures of start out brighter than that."""
+ANY = 0.1
+"""Share of any hair and any cloth in what the clip's own is taken for."""
 ROUNDS, FIELD_STEPS, COUPLING, CONTRAST = 8, 3, 4.0, 0.25
+"""How often distributions are fitted, and the field to them each time; weight of the mean of a place's neighbours; and
+difference in log brightness from which on a neighbour counts less."""
+LEAST_PRIOR, MOST_WEIGHT = 1e-4, 4.0
+"""What no topology rules out, and how many frames' worth count of any one place, since all frames show the same."""
 STRENGTH = 0.08
 """Of all places: what the start of hair, cloth and lips counts as. Skin stays as it started: what a beard's thin border
 adds to it would let it take the beard."""
-EVIDENCE = 1.0
-"""Neighbours' features are not independent: their likelihood counts to this power."""
 SEEN = 0.4
 """Frames' worth of looking straight at a place from which on it is rather known than not."""
+DEEP_IN_SCALP = 0.9
+"""Share of scalp around a place from which on nothing shades it but its own hair: what is dark there and as red as skin
+is hair."""
 STARTING_DISTANCE = 9.0
 """Squared Mahalanobis distance from skin from which on a place is rather something else."""
+MOST_PLACES = 20_000
+"""That distributions are fitted to."""
 LEAST_SEEDS = 30
 """Vertices of the face that frames have to show for its skin to have a distribution."""
 
@@ -72,6 +82,11 @@ class Mixture:
     def log_density(self, values: np.ndarray) -> np.ndarray:
         """[N, D] -> [N]."""
         return np.logaddexp.reduce(self._parts(values), axis=1)
+
+    def first(self, count: int) -> Mixture:
+        """That of the first distributions alone."""
+        share = self.share[:count]
+        return Mixture(share / share.sum(), self.mean[:count], self.covariance[:count])
 
     def _parts(self, values: np.ndarray) -> np.ndarray:
         parts = []
@@ -101,42 +116,57 @@ class Mixture:
 
 
 def material_probabilities(surface: Surface, features: SurfaceFeatures) -> np.ndarray:
-    """[V, len(LABELS)] of the surface's vertices, rows that sum to 1: all unknown where the surface has no segments or
-    frames show too little of the face."""
-    unknown = np.zeros((len(features.weight), len(LABELS)))
-    unknown[:, UNKNOWN] = 1.0
-    if surface.face_segment is None:
+    """[V, len(LABELS)] of the surface's vertices, rows that sum to 1: all unknown where the surface has not the head
+    model's segments or frames show too little of the face."""
+    values, known = _descriptors(features), features.weight > 0
+    skin = _skin_of(surface, features, values) if set(surface.segment_names) == set(PRIORS) else None
+    if skin is None:
+        unknown = np.zeros((len(values), len(LABELS)))
+        unknown[:, UNKNOWN] = 1.0
         return unknown
-    values = _descriptors(features)
-    seen = features.weight / (features.weight + SEEN)
-    known = features.weight > 0
-    if known.sum() < LEAST_SEEDS:
-        return unknown
-    prior = np.maximum(_prior(surface), 1e-4)
-    seeds = known & surface.vertices_of(SEEDS) & (features.weight >= np.median(features.weight[known]))
-    if seeds.sum() < LEAST_SEEDS:
-        return unknown
-    skin = _skin_start(values[seeds])
-    hair, cloth = (_start_beside(skin, *start) for start in (HAIR_START, CLOTH_START))
     own = known & surface.vertices_of(("lips",))
-    lips = _one_start(values[own]) if own.any() else Mixture(skin.share[:1], skin.mean[:1], skin.covariance[:1])
-    starts = (skin, hair, cloth, lips)
-    distance = _distance(skin, values)
-    unlike = 1.0 / (1.0 + np.exp(0.5 * np.clip(STARTING_DISTANCE - distance, -50, 50)))
-    belief = prior * np.stack([1.0 - unlike, unlike, unlike, np.ones(len(values))], 1)
+    lips = _one_start(values[own]) if own.any() else skin.first(1)
+    starts = (_start_beside(skin, *HAIR_START), _start_beside(skin, *CLOTH_START), lips)
+    lit = skin.first(len(skin.share) - 1)
+    of_skin = np.where(_inside(surface, ("scalp",), PRIOR_MM) > DEEP_IN_SCALP, lit.log_density(values),
+                       skin.log_density(values))
+    seen = features.weight / (features.weight + SEEN)
+    belief = _belief(_prior(surface), values, features.weight, seen, _neighbours(surface, features), of_skin,
+                     _likeness(skin, values), starts)
+    return _with_parts(surface, belief, seen)
+
+
+def _skin_of(surface: Surface, features: SurfaceFeatures, values: np.ndarray) -> Mixture | None:
+    """The skin's distribution by the face's places that frames see best; None where they show too few."""
+    seeds = (features.weight > 0) & surface.vertices_of(SEEDS)
+    if seeds.sum() < LEAST_SEEDS:
+        return None
+    return _skin_start(values[seeds & (features.weight >= np.median(features.weight[seeds]))])
+
+
+def _belief(prior: np.ndarray, values: np.ndarray, weight: np.ndarray, seen: np.ndarray, neighbours: sparse.csr_matrix,
+            of_skin: np.ndarray, likeness: np.ndarray, starts: tuple[Mixture, ...]) -> np.ndarray:
+    """[V, 4] probabilities of skin, hair, cloth and lips: distributions are fitted to where each is likely, then the
+    field to these, in turn.
+
+    prior [V, 4]; values [V, 5]; weight, seen [V]: how often each is seen, and its share that counts; of_skin [V]: the
+    skin's log density; likeness [V]: to skin, 0 to 1; starts: of hair, cloth and lips.
+    """
+    prior = np.maximum(prior, LEAST_PRIOR)
+    belief = prior * np.stack([likeness, 1.0 - likeness, 1.0 - likeness, np.ones(len(prior))], 1)
     belief /= belief.sum(1, keepdims=True)
-    area, mixtures = features.weight.clip(max=4.0), starts
-    neighbours = _neighbours(surface, features)
+    some = np.nonzero(weight > 0)[0]
+    some = some[:: -(-len(some) // MOST_PLACES)]
+    count, others = weight[some].clip(max=MOST_WEIGHT), starts
     for _ in range(ROUNDS):
-        others = [mixture.fitted(values[known], (area * own)[known], start, strength=STRENGTH * area.sum())
-                  for mixture, start, own in zip(mixtures[1:], starts[1:], belief.T[1:], strict=True)]
-        mixtures = (skin, *others)
-        density = np.stack([_with_any(mixture, start, values) for mixture, start in
-                            zip(mixtures, starts, strict=True)], 1)
-        told = EVIDENCE * seen[:, None] * density + np.log(prior)
+        others = [mixture.fitted(values[some], count * own[some], start, strength=STRENGTH * count.sum())
+                  for mixture, start, own in zip(others, starts, belief.T[1:], strict=True)]
+        density = np.stack([of_skin, *(_with_any(mixture, start, values) for mixture, start in
+                                       zip(others, starts, strict=True))], 1)
+        told = seen[:, None] * density + np.log(prior)
         for _ in range(FIELD_STEPS):
             belief = _softmax(told + COUPLING * (neighbours @ belief - 1.0))
-    return _with_parts(surface, belief, seen)
+    return belief
 
 
 def _descriptors(features: SurfaceFeatures) -> np.ndarray:
@@ -164,18 +194,20 @@ def _skin_start(values: np.ndarray) -> Mixture:
 
 def _start_beside(skin: Mixture, offset: np.ndarray, spread: np.ndarray) -> Mixture:
     """Three broad distributions beside the skin's first: dark, like any, and bright ones."""
-    shifts = np.array([[-0.5], [0.0], [0.6]]) * np.array([1.0, 0, 0, 0, 0])
-    return Mixture(np.full(3, 1 / 3), skin.mean[0] + offset + shifts, np.stack([np.diag(spread**2)] * 3))
+    count = len(BRIGHTER)
+    shifts = np.outer(BRIGHTER, [1.0, 0.0, 0.0, 0.0, 0.0])
+    return Mixture(np.full(count, 1 / count), skin.mean[0] + offset + shifts, np.stack([np.diag(spread**2)] * count))
 
 
-def _distance(skin: Mixture, values: np.ndarray) -> np.ndarray:
-    """[N] squared Mahalanobis distance from the nearest of the skin's distributions."""
-    own = [(((values - mean) ** 2) / np.diag(covariance)).sum(1) for mean, covariance in
+def _likeness(skin: Mixture, values: np.ndarray) -> np.ndarray:
+    """[N] 0 to 1 by the squared Mahalanobis distance from the nearest of the skin's distributions."""
+    off = [(((values - mean) ** 2) / np.diag(covariance)).sum(1) for mean, covariance in
            zip(skin.mean, skin.covariance, strict=True)]
-    return np.min(own, axis=0)
+    return 1.0 / (1.0 + np.exp(0.5 * np.clip(np.min(off, axis=0) - STARTING_DISTANCE, -50, 50)))
 
 
 def _with_any(mixture: Mixture, start: Mixture, values: np.ndarray) -> np.ndarray:
+    """[N] log density of the clip's own with a share of any."""
     return np.logaddexp(np.log(1 - ANY) + mixture.log_density(values), np.log(ANY) + start.log_density(values))
 
 
@@ -211,7 +243,7 @@ def _prior(surface: Surface) -> np.ndarray:
     chin = mesh.vertices[mesh.faces[surface.faces_of(("chin",))], 1].min()
     low = np.clip((chin - mesh.vertices[:, 1] - CLOTH_BELOW_MM[0]) / (CLOTH_BELOW_MM[1] - CLOTH_BELOW_MM[0]), 0.0, 1.0)
     neck = surface.vertices_of(("neck",)) & (low > 0)
-    cloth = np.where(neck, LOWEST_CLOTH * low, 0.02 * prior[:, 2])
+    cloth = np.where(neck, LOWEST_CLOTH * low, LEAST_CLOTH * prior[:, 2])
     prior = np.concatenate([prior[:, :2] * ((1 - cloth) / prior[:, :2].sum(1))[:, None], cloth[:, None]], 1)
     lips = 0.95 * _inside(surface, ("lips",), LIP_MM)[:, None]
     return np.concatenate([prior * (1.0 - lips), lips], 1)

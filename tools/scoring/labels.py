@@ -2,7 +2,8 @@
 
 Intersection over union of each label, twice: of texels by their area on the result's surface, each with the label that
 most of the truth's frames show there, weighted by the square of the view cosine; and of the pixels of these frames that
-the result's mesh covers. What the result calls unknown is missed. Where the truth is unknown nothing is compared.
+the result's mesh covers. Where either of them is unknown nothing is compared; how much the result leaves open stands
+beside.
 """
 
 from __future__ import annotations
@@ -42,12 +43,14 @@ def label_scores(frames: Path, export: Path, mesh: Mesh, poses: dict[int, np.nda
     label, expected = block[texels.pixel][seen].argmax(1), votes[seen].argmax(1)
     area = np.square(texel_size(mesh, texels.size))[texels.face[seen]]
     pixels = pixel_labels(mesh, found, truth, poses, intrinsics)
+    both = pixels[0] != UNKNOWN
     known = expected != UNKNOWN
+    named = known & (label != UNKNOWN)
     all_true = np.concatenate([image.ravel() for image in truth.values()])
     there, covered = (np.bincount(values, minlength=len(LABELS)) for values in (all_true, pixels[1]))
     return {
-        "texels": agreement(label[known], expected[known], area[known]),
-        "pixels": agreement(*pixels, np.ones(len(pixels[0]))),
+        "texels": agreement(label[named], expected[named], area[named]),
+        "pixels": agreement(pixels[0][both], pixels[1][both], np.ones(both.sum())),
         "unknown": float(area[known & (label == UNKNOWN)].sum() / max(area[known].sum(), 1e-12)),
         "covered": {name: float(covered[k] / there[k]) for k, name in enumerate(LABELS) if k != UNKNOWN and there[k]},
     }
