@@ -7,9 +7,10 @@ Reads    sample_frames: frames.json and the frames (for the plates and the repor
 Writes   head.usda with its payload, head.usdz, head.glb, mesh.obj, maps/*.exr, envmap.exr, envmaps/*.exr, poses.npz,
          plates/*.jpg, renders/*.exr, views/*.exr, run.json, methods.txt, report.html.
 Method   The head model's facial actions are carried over to the solved head, where the mesh is the model's, and written
-         as blend shapes. Edges of the full mesh are collapsed to meshes of fewer faces. Units, axes, colour spaces and
-         sources are stated on everything that is written; then the asset is validated as a stranger would find it on
-         disk.
+         as blend shapes. Edges of the full mesh are collapsed to meshes of fewer faces; the head model's quads are laid
+         under it as a subdivision surface, and what it has beyond that becomes a displacement map. Units, axes, colour
+         spaces and sources are stated on everything that is written; then the asset is validated as a stranger would
+         find it on disk.
 Fails    values that are not finite, a mesh with broken indices or UVs, a map that is not a square power of two,
          anything that usd-core's validators or the MaterialX definitions object to.
 """
@@ -69,7 +70,8 @@ STAGE = Stage(
         Parameter("usdz", bool, True, "Also pack everything into head.usdz."),
         Parameter("glb", bool, True, "Also write binary glTF."),
         Parameter("actions", bool, True, "Also write facial actions as blend shapes, if the mesh is the head model's."),
-        Parameter("detail", bool, True, "Also write meshes of 20,000 and 5,000 faces, as variants of the asset."),
+        Parameter("detail", bool, True, "Also write meshes of 20,000 and 5,000 faces, variants of the asset, and quads "
+                  "with a displacement map if the mesh is the head model's."),
         Parameter("plates", bool, True, "Also write the clip's frames, shown behind the head in USD as a guide."),
         Parameter("views", bool, True, "Also render the head from the side and under other lights."),
         Parameter("view_size", int, 512, "Edge of those pictures.", "px", 64, 4096),
@@ -123,6 +125,26 @@ def find_actions(job: Job, surface) -> tuple[tuple, dict]:
     return shapes, {"names": names, "lacking": lacking_names(tuple(names)), "note": note}
 
 
+def find_base(job: Job, surface, writer):
+    """The head as quads, with maps/displacement.exr; None when switched off, or where the mesh is not the head
+    model's."""
+    from shared.geometry.mesh import is_subdivision
+    from shared.imaging.displacement import displaced_base
+    from shared.io.export_maps import DISPLACEMENT
+    from shared.io.usd import BaseHead
+    from shared.io.usd_material import TextureFile
+    from shared.tracking.models import load_head_model
+
+    if not job.params.detail or surface.face_segment is None:
+        return None
+    model = load_head_model()
+    if not is_subdivision(surface.mesh, model.faces, model.face_uvs):
+        return None
+    displaced = displaced_base(surface.mesh, model.faces, model.face_uvs)
+    writer.write_map(job.out / "maps", DISPLACEMENT, displaced.heights)
+    return BaseHead(displaced, TextureFile(f"./maps/{writer.file_name(DISPLACEMENT)}"))
+
+
 def write_images(job: Job, writer, maps: dict, envmap, frames, render_frames: list[int]) -> None:
     """maps/, envmap.exr and renders/ in the chosen precision and colour space."""
     from shared.io.export_maps import SOLVED_MAPS, paste_crop, write_png_copies
@@ -164,9 +186,9 @@ def near_lamp(solve: dict):
     return BallLamp(tuple(lamp["position_mm"]), lamp["radius_mm"], tuple(lamp["radiance"]))
 
 
-def describe_asset(job: Job, mesh, eyes, actions, details, capture, frames, writer, lamp):
+def describe_asset(job: Job, mesh, eyes, actions, details, base, capture, frames, writer, lamp):
     """The asset that head.usda and head.usdz hold; writes the plates. actions: its blend shapes; details: {variant: the
-    mesh with fewer faces}; lamp: what stands near of the light, or None."""
+    mesh with fewer faces}; base: the mesh as displaced quads, or None; lamp: what stands near of the light, or None."""
     from shared.io.plates import crop_rectangle, write_plates
     from shared.io.usd import HeadAsset
     from shared.io.usd_capture import Plate
@@ -187,7 +209,7 @@ def describe_asset(job: Job, mesh, eyes, actions, details, capture, frames, writ
         "confidence_map": f"maps/{writer.file_name('confidence')}",
     }
     light = TextureFile("./envmap.exr" if lamp is None else "./envmap_far.exr", writer.colour_space)
-    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, lamp, eyes, actions, details,
+    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, lamp, eyes, actions, details, base,
                      version=str(STAGE.version), metadata=metadata)
 
 
@@ -361,7 +383,7 @@ def run(job: Job) -> None:
     actions, said_of_them = find_actions(job, surface)
     wanted = REDUCED_FACES if params.detail else {PAGE_DETAIL: REDUCED_FACES[PAGE_DETAIL]}
     details = dict(zip(wanted, reduced(surface, tuple(wanted.values())), strict=True))
-    asset = describe_asset(job, mesh, eyes, actions, details if params.detail else {},
+    asset = describe_asset(job, mesh, eyes, actions, details if params.detail else {}, find_base(job, surface, writer),
                            describe_capture(job, poses, frames), frames, writer, lamp)
     write_assets(job, asset, eyeballs, poses, maps, far)
     views = render_views(job, writer, mesh, eyes, maps, envmap, poses, frames, solve)

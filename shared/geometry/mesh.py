@@ -200,6 +200,17 @@ def subdivide(mesh: Mesh) -> Mesh:
     return Mesh(geometry @ mesh.vertices, faces.astype(np.int32), texture @ mesh.uvs, face_uvs.astype(np.int32))
 
 
+def is_subdivision(mesh: Mesh, faces: np.ndarray, face_uvs: np.ndarray) -> bool:
+    """Whether the mesh has the faces that subdivide makes of coarse ones faces [F, 3] and face_uvs [F, 3]."""
+    for found, coarse in ((mesh.faces, faces), (mesh.face_uvs, face_uvs)):
+        while len(coarse) < len(found):
+            edges, corners, _ = mesh_edges(coarse)
+            coarse = _split(coarse, corners, int(coarse.max()) + 1)
+        if not np.array_equal(coarse, found):
+            return False
+    return True
+
+
 def interpolate(values: np.ndarray, faces: np.ndarray, face_index: np.ndarray, bary: np.ndarray) -> np.ndarray:
     """Barycentric interpolation: values [V, ...] at face_index [N] with corner weights bary [N, 3] -> [N, ...]."""
     corners = faces[face_index]

@@ -9,6 +9,7 @@ import numpy as np
 
 from shared.geometry.eyeballs import SIDES, Eyeball
 from shared.geometry.mesh import Mesh, shading_normals
+from shared.geometry.quads import QuadMesh
 
 HEAD, EYES = "head", tuple(f"eye_{side}" for side in SIDES)
 """Names of the parts; the eyes in the order of SIDES."""
@@ -53,8 +54,15 @@ def _part(mesh: Mesh, normals: np.ndarray, name: str, faces: np.ndarray, pivot: 
     return RigidPart(name, part, normals[used], pivot, used)
 
 
+def quad_part(whole: QuadMesh, kept: np.ndarray) -> tuple[QuadMesh, np.ndarray]:
+    """The quads kept [Q] bool as a mesh of their own, and which vertices of the whole it has [n] int."""
+    used, corners = _by_first_use(whole.quads[kept])
+    used_uvs, uv_corners = _by_first_use(whole.quad_uvs[kept])
+    return QuadMesh(whole.vertices[used], corners, whole.uvs[used_uvs], uv_corners), used
+
+
 def _by_first_use(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[F, 3] indices -> those that occur, in the order in which they do, and the corners in their numbers [F, 3].
+    """[F, K] indices -> those that occur, in the order in which they do, and the corners in their numbers [F, K].
 
     Neighbours get numbers close to each other, which USD keeps in fewer bytes.
     """

@@ -60,6 +60,16 @@ class FrameView:
         return [self.rows[start : start + _BLOCK] for start in range(0, len(self.rows), _BLOCK)]
 
 
+def nearest_shown(shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[H, W] bool -> places [n] of an image, row by row, where nothing is shown, and of each the nearest one where
+    something is [n]."""
+    empty = np.nonzero(~shown.ravel())[0]
+    if len(empty) == 0:
+        return empty, empty
+    rows, columns = distance_transform_edt(~shown, return_distances=False, return_indices=True)
+    return empty, rows.ravel()[empty] * np.int64(shown.shape[1]) + columns.ravel()[empty]
+
+
 class TexelSurface:
     """The T texels of a size x size map that lie on the mesh: face [T], bary [T, 3]."""
 
@@ -102,13 +112,9 @@ class TexelSurface:
     @cached_property
     def _gutters(self) -> tuple[np.ndarray, np.ndarray]:
         """Places in the image where nothing lies, and of each the nearest one where something does."""
-        background = np.ones((self.size, self.size), bool)
-        background.ravel()[self.pixel] = False
-        empty = np.nonzero(background.ravel())[0]
-        if len(empty) == 0:
-            return empty, empty
-        rows, columns = distance_transform_edt(background, return_distances=False, return_indices=True)
-        return empty, rows.ravel()[empty] * np.int64(self.size) + columns.ravel()[empty]
+        shown = np.zeros((self.size, self.size), bool)
+        shown.ravel()[self.pixel] = True
+        return nearest_shown(shown)
 
     def frame_view(
         self, view: View, picture: Picture, intrinsics: np.ndarray, values: np.ndarray | None = None

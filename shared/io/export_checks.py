@@ -18,7 +18,7 @@ from pxr import Tf, UsdUtils
 from shared.errors import InputError, LimnError
 from shared.geometry.mesh_checks import mesh_errors, uv_overlap
 from shared.io.arrays import load_arrays
-from shared.io.export_maps import MAPS, map_errors, map_file, read_map
+from shared.io.export_maps import DISPLACEMENT, MAPS, map_errors, map_file, read_map
 from shared.io.exr_checks import header_errors, header_gaps
 from shared.io.exr_header import check_decodable
 from shared.io.gltf_validate import glb_errors
@@ -75,7 +75,9 @@ def check_export(
     checks.headers()
     checks.of("mesh.obj", checks.mesh)
     for name in MAPS:
-        checks.of(_map_path(folder, name), lambda file, name=name: checks.map(file, name))
+        file = _map_path(folder, name)
+        if name != DISPLACEMENT or checks.files(file):  # the layers say whether there should be one
+            checks.of(file, lambda file, name=name: checks.map(file, name))
     checks.map_sizes()
     checks.of("envmap.exr", checks.light)
     checks.of("poses.npz", checks.poses)
@@ -173,7 +175,8 @@ class _Checks:
     def map(self, file: str, name: str) -> list[str]:
         """Shape and values of one map."""
         values = read_map(self.folder / file, name)
-        self.sizes[file] = values.shape[1], values.shape[0]
+        if name != DISPLACEMENT:  # it needs no more texels than the mesh has vertices for
+            self.sizes[file] = values.shape[1], values.shape[0]
         return map_errors(name, values)
 
     def map_sizes(self) -> None:

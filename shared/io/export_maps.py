@@ -22,9 +22,14 @@ MAPS = {
     "confidence": ("data", "0 to 1: how well the clip determines the texel"),
     "material": ("materials", "0 to 1: probability of each material; Y: number of the likeliest"),
     "specular_ior": ("data", "index of refraction that shows the specular intensity, for UsdPreviewSurface"),
+    "displacement": ("data", "mm along the normal of the subdivided base mesh"),
 }
-SOLVED_MAPS = tuple(name for name in MAPS if name not in ("material", "specular_ior"))
-"""Those that inverse_render solves; specular_ior follows from specular_intensity, material tells them apart."""
+DISPLACEMENT = "displacement"
+SOLVED_MAPS = tuple(name for name in MAPS if name not in ("material", "specular_ior", DISPLACEMENT))
+"""Those that inverse_render solves; specular_ior follows from specular_intensity, displacement from the mesh, and material
+tells skin from hair and others."""
+LARGEST_HEIGHT_MM = 10.0
+"""A displacement beyond it joins what are different parts of a head."""
 _UP_TO_ONE = ("diffuse_albedo", "confidence", "normal", "roughness", "material")
 UDIM_TILE = 1001
 WORKING_SPACE, ACESCG = "lin_rec709_scene", "lin_ap1_scene"
@@ -48,8 +53,9 @@ def map_file(name: str, udim: bool) -> str:
 class MapWriter:
     """Writes linear Rec.709 and data arrays with one choice of precision, colour space, layout and names.
 
-    half: 16-bit floats, values beyond +-65504 clamped. acescg: colours are converted. attributes go into each file.
-    layout: of the maps, one of images.LAYOUTS. udim: maps are named as tile 1001 of a set of tiles.
+    half: 16-bit floats, values beyond +-65504 clamped; the displacement has 32 bits in any case. acescg: colours are
+    converted. attributes go into each file. layout: of the maps, one of images.LAYOUTS. udim: maps are named as tile
+    1001 of a set of tiles.
     """
 
     def __init__(
@@ -90,7 +96,10 @@ class MapWriter:
         converted = acescg_from_rec709(values) if is_colour and self.acescg else values
         space = self.colour_space if is_colour else "data"
         content = {"unit": unit, "content": name}
-        self._write(folder / self.file_name(name), converted, space, content, layout=self.layout)
+        if name == DISPLACEMENT:
+            content |= {"scale": 1.0, "midpoint": 0.0}
+        self._write(folder / self.file_name(name), converted, space, content, layout=self.layout,
+                    half=self.half and name != DISPLACEMENT)
 
     def write_maps(self, folder: Path, maps: Mapping[str, np.ndarray]) -> None:
         """Each of maps, named as in MAPS, into folder."""
@@ -98,9 +107,9 @@ class MapWriter:
         for name, values in maps.items():
             self.write_map(folder, name, values)
 
-    def _write(self, path, values, colour_space, attributes, latlong=False, layout="scanline") -> None:
-        attributes = {**self.attributes, **attributes}
-        write_exr(path, values, colour_space=colour_space, half=self.half, attributes=attributes, latlong=latlong,
+    def _write(self, path, values, colour_space, attributes, latlong=False, layout="scanline", half=None) -> None:
+        attributes, half = {**self.attributes, **attributes}, self.half if half is None else half
+        write_exr(path, values, colour_space=colour_space, half=half, attributes=attributes, latlong=latlong,
                   layout=layout)
 
 
@@ -148,9 +157,11 @@ def map_errors(name: str, values: np.ndarray) -> list[str]:
         errors.append(f"{width} x {height} is not a square power of two")
     if not np.isfinite(values).all():
         return [*errors, f"{np.count_nonzero(~np.isfinite(values))} values are not finite"]
-    lowest = 1.0 if name == "specular_ior" else 0.0
+    lowest = {"specular_ior": 1.0, DISPLACEMENT: -LARGEST_HEIGHT_MM}.get(name, 0.0)
     if values.min() < lowest - 1e-3:
         errors.append(f"values down to {values.min():.4g}, expected at least {lowest:.0f}")
+    if name == DISPLACEMENT and values.max() > LARGEST_HEIGHT_MM:
+        errors.append(f"values up to {values.max():.4g}, expected at most {LARGEST_HEIGHT_MM:.0f}")
     if name in _UP_TO_ONE and values.max() > 1.0 + 1e-3:
         errors.append(f"values up to {values.max():.4g}, expected at most 1")
     return errors + (material_errors(values) if name == "material" else [])

@@ -22,16 +22,15 @@ import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from shared.errors import LimnError
 from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.eyeballs import EYE_ROUGHNESS, TEAR_FILM_IOR, Eyeball
 from shared.geometry.mesh import Mesh, unique_pairs
 from shared.geometry.parts import HEAD, RigidPart, head_parts
 from shared.io.export_maps import integer_codes
+from shared.io.images import texture_png
 from shared.io.usd_capture import UsdCapture, eye_turns, world_from_head_rigid, world_from_usd_camera
 
 METRES_PER_MM = 0.001
@@ -219,18 +218,7 @@ def _material(buffer: _Buffer, maps: Mapping[str, np.ndarray]) -> tuple[list[int
         "normalTexture": {"index": 2},
         "extensions": {"KHR_materials_specular": specular},
     }
-    return [buffer.add(_png(picture)) for picture in pictures], material
-
-
-def _png(picture: np.ndarray) -> bytes:
-    """uint8 [H, W, 3] RGB or [H, W, 4] RGBA."""
-    order = [2, 1, 0, 3][: picture.shape[2]]
-    settings = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
-                cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_PAETH]
-    done, encoded = cv2.imencode(".png", np.ascontiguousarray(picture[..., order]), settings)
-    if not done:
-        raise LimnError("a texture could not be encoded")
-    return encoded.tobytes()
+    return [buffer.add(texture_png(picture)) for picture in pictures], material
 
 
 def _animation(buffer: _Buffer, capture: UsdCapture, eye_count: int) -> dict:

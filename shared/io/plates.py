@@ -12,7 +12,7 @@ from shared.errors import LimnError
 from shared.imaging.color import decode_transfer, encode_srgb
 from shared.io.frames import FrameSet
 
-LONGEST_SIDE, QUALITY = 1024, 85
+LONGEST_SIDE, QUALITY = 1024, 80
 
 
 def srgb_codes(frames: FrameSet) -> np.ndarray:

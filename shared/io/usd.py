@@ -38,8 +38,10 @@ from shared.errors import LimnError
 from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.eyeballs import Eyeball
 from shared.geometry.mesh import Mesh, shading_normals
-from shared.geometry.parts import EYES, HEAD, RigidPart, head_parts
+from shared.geometry.parts import EYES, HEAD, RigidPart, head_parts, quad_part
+from shared.geometry.quads import QuadMesh
 from shared.geometry.reduction import ReducedMesh
+from shared.imaging.displacement import DisplacedBase
 from shared.io.usd_actions import bind_actions, define_skeleton
 from shared.io.usd_capture import (
     BallLamp,
@@ -54,12 +56,21 @@ from shared.io.usd_capture import (
     turn,
     world_from_head_rigid,
 )
-from shared.io.usd_detail import FULL, define_details, each_detail
-from shared.io.usd_material import EYE, EYE_MAPS, TextureFile, define_material
+from shared.io.usd_detail import BASE, DETAIL_SET, FULL, define_details, each_detail
+from shared.io.usd_material import EYE, EYE_MAPS, TextureFile, define_displacement, define_material
+from shared.io.usd_variants import define_variants, in_variant
 
 METERS_PER_UNIT = 0.001
 VARIANT_SET, VARIANT_CLIP, VARIANT_STILL = "capture", "clip", "still"
 INTERFACE, PAYLOAD, GEOMETRY, MATERIALS = "head.usda", "head_payload.usda", "head_geo.usdc", "head_mtl.usda"
+
+
+@dataclass(frozen=True, eq=False)
+class BaseHead:
+    """The head as quads, and the file of their displacement."""
+
+    displaced: DisplacedBase
+    heights: TextureFile
 
 
 @dataclass(frozen=True)
@@ -69,8 +80,8 @@ class HeadAsset:
     maps: {name of usd_material.SHADER_INPUTS: texture}; envmap: the dome light's texture; lamp: what stands near of the
     light and is not in that texture, or None; plate: the clip's frames, or None; eyes: the right and the left eyeball
     of the mesh, to be meshes of their own, or none; actions: blend shapes of the mesh, which move no eyeball; details:
-    {variant: the mesh with fewer faces}; metadata: nested dictionaries of strings, numbers and lists for the root
-    prim's customData["limn"].
+    {variant: the mesh with fewer faces}; base: the mesh as displaced quads, or None; metadata: nested dictionaries of
+    strings, numbers and lists for the root prim's customData["limn"].
     """
 
     name: str
@@ -83,8 +94,14 @@ class HeadAsset:
     eyes: Sequence[Eyeball] = ()
     actions: Sequence[BlendShape] = ()
     details: Mapping[str, ReducedMesh] = field(default_factory=dict)
+    base: BaseHead | None = None
     version: str = "1"
     metadata: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def variants(self) -> tuple[str, ...]:
+        """Of the set `detail`, but for the full one."""
+        return (*self.details, *([BASE] if self.base else []))
 
 
 def prim_name(name: str) -> str:
@@ -166,12 +183,27 @@ def _define_geometry(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None
             prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*map(float, part.pivot)))
             # The variants give its value: one that stood here would be stronger than theirs in a single layer.
             prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
-    for detail in each_detail(stage.GetPrimAtPath(root), asset.details):
-        for part in full if detail == FULL else _reduced_parts(asset, detail):
-            prim = define_mesh(stage, str(geo.AppendChild(part.name)), part.mesh, part.normals)
+    for detail in each_detail(stage.GetPrimAtPath(root), asset.variants):
+        for part in _reduced_parts(asset, detail) if detail in asset.details else full:
+            path = geo.AppendChild(part.name)
+            if detail == BASE and part.name == HEAD:
+                _define_base(stage, path, asset, skeleton)
+                continue
+            prim = define_mesh(stage, str(path), part.mesh, part.normals)
             if part.name == HEAD and skeleton:
                 count = len(asset.mesh.vertices)
                 bind_actions(prim, skeleton, [shape.of_part(part.vertices, count) for shape in asset.actions])
+
+
+def _define_base(stage: Usd.Stage, path: Sdf.Path, asset: HeadAsset, skeleton: Sdf.Path | None) -> None:
+    """The head as quads with its actions; eyeballs that turn are not among them: nothing displaces those."""
+    displaced = asset.base.displaced
+    apart = np.concatenate([np.zeros(0, int), *(eye.faces for eye in asset.eyes)])
+    head, used = quad_part(displaced.cage, displaced.quads_beside(apart))
+    prim = define_cage(stage, str(path), head)
+    if skeleton:
+        count = len(displaced.cage.vertices)
+        bind_actions(prim, skeleton, [displaced.fit.shape(shape).of_part(used, count) for shape in asset.actions])
 
 
 def _reduced_parts(asset: HeadAsset, detail: str) -> tuple[RigidPart, ...]:
@@ -185,6 +217,9 @@ def _define_materials(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> Non
     UsdGeom.Scope.Define(stage, root.AppendChild("mtl"))
     material = define_material(stage, str(root.AppendPath("mtl/skin")), asset.maps)
     _bind(stage, root, HEAD, material)
+    if asset.base:
+        with in_variant(stage.GetPrimAtPath(root), DETAIL_SET, BASE, FULL):
+            define_displacement(stage, material, asset.base.heights)
     if asset.eyes:
         shared = {name: asset.maps[name] for name in EYE_MAPS if name in asset.maps}
         eye = define_material(stage, str(root.AppendPath("mtl/eye")), shared, EYE)
@@ -207,10 +242,11 @@ def _define_interface(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> Non
     stage.GetRootLayer().documentation = (
         "A head recovered from a clip by Limn. Lengths in millimetres; time codes are frames of the clip. "
         "Variant set 'capture': 'clip' replays the clip with its camera and light, 'still' is the head alone. "
-        "Variant set 'detail': 'full', or about as many triangles as the name says."
+        "Variant set 'detail': 'full', or about as many triangles as the name says, or 'base', quads under subdivision "
+        "whose displacement makes the full head of them."
     )
     prim = stage.GetPrimAtPath(root)
-    define_details(prim, asset.details)
+    define_details(prim, asset.variants)
     model = Usd.ModelAPI(prim)
     model.SetKind(Kind.Tokens.component)
     model.SetAssetName(root.name)
@@ -221,17 +257,13 @@ def _define_interface(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> Non
 
 
 def _define_variants(stage: Usd.Stage, root: Usd.Prim, asset: HeadAsset) -> None:
-    variants = root.GetVariantSets().AddVariantSet(VARIANT_SET)
-    for name in (VARIANT_CLIP, VARIANT_STILL):
-        variants.AddVariant(name)
+    define_variants(root, VARIANT_SET, (VARIANT_CLIP, VARIANT_STILL), VARIANT_CLIP)
     vertices = asset.mesh.vertices
     UsdGeom.ModelAPI.Apply(root)
-    variants.SetVariantSelection(VARIANT_STILL)
-    with variants.GetVariantEditContext():
+    with in_variant(root, VARIANT_SET, VARIANT_STILL, VARIANT_CLIP):
         _set_extents(root, vertices[None])
         _define_gaze(root, asset, moves=False)
-    variants.SetVariantSelection(VARIANT_CLIP)
-    with variants.GetVariantEditContext():
+    with in_variant(root, VARIANT_SET, VARIANT_CLIP, VARIANT_CLIP):
         moved = world_from_head_rigid(asset.capture)
         box = np.array(np.meshgrid(*np.stack([vertices.min(0), vertices.max(0)]).T)).reshape(3, -1).T
         _set_extents(root, np.einsum("fij,nj->fni", moved[:, :3, :3], box) + moved[:, None, :3, 3])
@@ -283,21 +315,38 @@ def _camera_metadata(capture: UsdCapture) -> dict:
 
 def define_mesh(stage: Usd.Stage, path: str, mesh: Mesh, normals: np.ndarray) -> UsdGeom.Mesh:
     """A polygon mesh (subdivisionScheme none) with indexed faceVarying UVs and normals [V, 3], and its extent."""
-    prim = UsdGeom.Mesh.Define(stage, path)
-    points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.vertices, np.float32))
-    faces = Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.faces.ravel(), np.int32))
-    prim.CreatePointsAttr(points)
-    prim.CreateFaceVertexIndicesAttr(faces)
-    prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
+    prim = _define_polygons(stage, path, mesh.vertices, mesh.faces, mesh.uvs, mesh.face_uvs)
     prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    varying = UsdGeom.Tokens.faceVarying
+    corners = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("normals", Sdf.ValueTypeNames.Normal3fArray, varying)
+    corners.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, np.float32)))
+    corners.SetIndices(prim.GetFaceVertexIndicesAttr().Get())
+    return prim
+
+
+def define_cage(stage: Usd.Stage, path: str, cage: QuadMesh) -> UsdGeom.Mesh:
+    """The control mesh of a Catmull-Clark surface by the rules of geometry.quads, with faceVarying UVs; normals follow
+    from the surface."""
+    prim = _define_polygons(stage, path, cage.vertices, cage.quads, cage.uvs, cage.quad_uvs)
+    prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.catmullClark)
+    prim.CreateInterpolateBoundaryAttr(UsdGeom.Tokens.edgeOnly)
+    prim.CreateFaceVaryingLinearInterpolationAttr(UsdGeom.Tokens.all)
+    return prim
+
+
+def _define_polygons(
+    stage: Usd.Stage, path: str, vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray, face_uvs: np.ndarray
+) -> UsdGeom.Mesh:
+    """Points [V, 3], faces [F, K] and indexed faceVarying UVs [T, 2] by face_uvs [F, K], and the extent."""
+    prim = UsdGeom.Mesh.Define(stage, path)
+    points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices, np.float32))
+    prim.CreatePointsAttr(points)
+    prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces.ravel(), np.int32)))
+    prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), faces.shape[1], np.int32)))
     prim.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
     prim.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
-    primvars = UsdGeom.PrimvarsAPI(prim)
     types, varying = Sdf.ValueTypeNames, UsdGeom.Tokens.faceVarying
-    coordinates = primvars.CreatePrimvar("st", types.TexCoord2fArray, varying)
-    coordinates.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(mesh.uvs, np.float32)))
-    coordinates.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.face_uvs.ravel(), np.int32)))
-    corners = primvars.CreatePrimvar("normals", types.Normal3fArray, varying)
-    corners.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, np.float32)))
-    corners.SetIndices(faces)
+    coordinates = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("st", types.TexCoord2fArray, varying)
+    coordinates.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(uvs, np.float32)))
+    coordinates.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(face_uvs.ravel(), np.int32)))
     return prim

@@ -1,5 +1,8 @@
 """Levels of detail in USD: the variant set `detail` of the default prim.
 
+The variant `base` holds the head as few quads under subdivision, and gives its material the displacement that makes the
+full head of it.
+
 Each variant holds the points, faces, texture coordinates, normals and blend shapes of the meshes; their prims, their
 motion and their materials stand outside of it and are the same for all. Whoever puts the head far away, or many heads
 into one scene, chooses a variant there; nobody has to change anything else.
@@ -18,7 +21,9 @@ from collections.abc import Iterable, Iterator
 
 from pxr import Usd
 
-DETAIL_SET, FULL = "detail", "full"
+from shared.io.usd_variants import define_variants, in_variant
+
+DETAIL_SET, FULL, BASE = "detail", "full", "base"
 REDUCED_FACES = {"20k": 20_000, "5k": 5_000}
 """Variant -> how many faces head and eyes have together."""
 
@@ -27,10 +32,7 @@ def define_details(root: Usd.Prim, names: Iterable[str]) -> None:
     """The variants, of which the full one is chosen; none without names of reduced ones."""
     names = tuple(names)
     if names:
-        variants = root.GetVariantSets().AddVariantSet(DETAIL_SET)
-        for name in (FULL, *names):
-            variants.AddVariant(name)
-        variants.SetVariantSelection(FULL)
+        define_variants(root, DETAIL_SET, (FULL, *names), FULL)
 
 
 def each_detail(root: Usd.Prim, names: Iterable[str]) -> Iterator[str]:
@@ -41,8 +43,6 @@ def each_detail(root: Usd.Prim, names: Iterable[str]) -> Iterator[str]:
     if not names:
         yield FULL
         return
-    variants = root.GetVariantSet(DETAIL_SET)
     for name in (*names, FULL):
-        variants.SetVariantSelection(name)
-        with variants.GetVariantEditContext():
+        with in_variant(root, DETAIL_SET, name, FULL):
             yield name

@@ -14,8 +14,8 @@ does not.
 Eyes share the map of the albedo; over it lies the tear film, one smooth dielectric. OpenPBR's coat would lay a second
 interface over that one.
 
-References: UsdPreviewSurface specification 2.6; OpenPBR surface 1.1, section 3.6 (specular weight); MaterialX
-1.39.
+References: UsdPreviewSurface specification 2.6 (displacement: scene units along the normal); OpenPBR surface 1.1,
+section 3.6 (specular weight); MaterialX 1.39 (displacement).
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ _IMAGE_NODES = {
     "specular_weight": ("ND_image_float", Sdf.ValueTypeNames.Float, 1.0),
     "specular_roughness": ("ND_image_float", Sdf.ValueTypeNames.Float, 0.5),
     "geometry_normal": ("ND_image_vector3", Sdf.ValueTypeNames.Float3, Gf.Vec3f(0.5, 0.5, 1.0)),
+    "displacement": ("ND_image_float", Sdf.ValueTypeNames.Float, 0.0),
 }
 NORMAL_SCALE, NORMAL_BIAS = Gf.Vec4f(2.0, 2.0, 2.0, 1.0), Gf.Vec4f(-1.0, -1.0, -1.0, 0.0)
 """UsdUVTexture has to undo n * 0.5 + 0.5 by itself; the MaterialX normalmap node does it inside."""
@@ -104,6 +105,25 @@ def define_material(
     return material
 
 
+def define_displacement(stage: Usd.Stage, material: UsdShade.Material, heights: TextureFile) -> None:
+    """Moves the surface of a material of define_material along its normal by a map in units of the stage, for both
+    models: P' = P + height N, neither scaled nor shifted."""
+    path, types = material.GetPath(), Sdf.ValueTypeNames
+    coordinates = UsdShade.Shader.Get(stage, path.AppendChild("preview_st")).GetOutput("result")
+    texture = _preview_texture(stage, material, "displacement", heights, coordinates)
+    surface = UsdShade.Shader.Get(stage, path.AppendChild("preview_surface"))
+    surface.CreateInput("displacement", types.Float).ConnectToSource(texture.CreateOutput("r", types.Float))
+    moved = surface.CreateOutput("displacement", types.Token)
+    material.CreateDisplacementOutput().ConnectToSource(moved)
+
+    coordinates = UsdShade.Shader.Get(stage, path.AppendChild("openpbr_st")).GetOutput("out")
+    height = _image_node(stage, material, "displacement", "displacement", heights, coordinates)
+    node = _shader(stage, material, "openpbr_displace", "ND_displacement_float")
+    node.CreateInput("displacement", types.Float).ConnectToSource(height)
+    node.CreateInput("scale", types.Float).Set(1.0)
+    material.CreateDisplacementOutput("mtlx").ConnectToSource(node.CreateOutput("out", types.Token))
+
+
 def define_plate_material(stage: Usd.Stage, path: str, files: Mapping[int, str]) -> UsdShade.Material:
     """Shows files {time code: path relative to the layer}, sRGB pictures, as they are whatever the light."""
     material = UsdShade.Material.Define(stage, path)
@@ -144,13 +164,7 @@ def _preview_surface(
     for name, (preview_input, _) in SHADER_INPUTS.items():
         if preview_input is None or name not in maps:
             continue
-        texture = _shader(stage, material, f"preview_{name}", "UsdUVTexture")
-        texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
-        _file_input(texture, maps[name])
-        source = texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token)
-        source.Set(maps[name].preview_colour_space)
-        for axis in ("wrapS", "wrapT"):
-            texture.CreateInput(axis, Sdf.ValueTypeNames.Token).Set("clamp")
+        texture = _preview_texture(stage, material, name, maps[name], coordinates)
         if name == "normal":
             texture.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(NORMAL_SCALE)
             texture.CreateInput("bias", Sdf.ValueTypeNames.Float4).Set(NORMAL_BIAS)
@@ -175,14 +189,8 @@ def _open_pbr(
     for name, (_, open_pbr_input) in SHADER_INPUTS.items():
         if open_pbr_input is None or name not in maps:
             continue
-        node, value_type, default = _IMAGE_NODES[open_pbr_input]
-        image = _shader(stage, material, f"openpbr_{name}", node)
-        image.CreateInput("texcoord", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
-        _file_input(image, maps[name])
-        image.CreateInput("default", value_type).Set(default)
-        for axis in ("uaddressmode", "vaddressmode"):
-            image.CreateInput(axis, Sdf.ValueTypeNames.String).Set("clamp")
-        output = image.CreateOutput("out", value_type)
+        value_type = _IMAGE_NODES[open_pbr_input][1]
+        output = _image_node(stage, material, name, open_pbr_input, maps[name], coordinates)
         if name == "normal":
             bend = _shader(stage, material, "openpbr_normalmap", "ND_normalmap_float")
             bend.CreateInput("in", value_type).ConnectToSource(output)
@@ -190,6 +198,34 @@ def _open_pbr(
         surface.CreateInput(open_pbr_input, value_type).ConnectToSource(output)
     terminal = surface.CreateOutput("out", Sdf.ValueTypeNames.Token)
     material.CreateSurfaceOutput("mtlx").ConnectToSource(terminal)
+
+
+def _preview_texture(
+    stage: Usd.Stage, material: UsdShade.Material, name: str, file: TextureFile, coordinates: UsdShade.Output
+) -> UsdShade.Shader:
+    """Reads a map for UsdPreviewSurface; its outputs are left to the caller."""
+    texture = _shader(stage, material, f"preview_{name}", "UsdUVTexture")
+    texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
+    _file_input(texture, file)
+    texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set(file.preview_colour_space)
+    for axis in ("wrapS", "wrapT"):
+        texture.CreateInput(axis, Sdf.ValueTypeNames.Token).Set("clamp")
+    return texture
+
+
+def _image_node(
+    stage: Usd.Stage, material: UsdShade.Material, name: str, wanted: str, file: TextureFile,
+    coordinates: UsdShade.Output,
+) -> UsdShade.Output:
+    """Reads a map as MaterialX does for the input wanted, one of _IMAGE_NODES."""
+    node, value_type, default = _IMAGE_NODES[wanted]
+    image = _shader(stage, material, f"openpbr_{name}", node)
+    image.CreateInput("texcoord", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
+    _file_input(image, file)
+    image.CreateInput("default", value_type).Set(default)
+    for axis in ("uaddressmode", "vaddressmode"):
+        image.CreateInput(axis, Sdf.ValueTypeNames.String).Set("clamp")
+    return image.CreateOutput("out", value_type)
 
 
 def _shader(stage: Usd.Stage, material: UsdShade.Material, name: str, shader_id: str) -> UsdShade.Shader:

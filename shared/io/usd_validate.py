@@ -18,6 +18,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdValidation
 
 from shared.geometry.mesh import Mesh
 from shared.geometry.mesh_checks import mesh_errors
+from shared.geometry.quads import triangulated
 from shared.io.usd_material import NORMAL_BIAS, NORMAL_SCALE
 
 MATERIALX_PREFIX = "ND_"
@@ -33,6 +34,7 @@ _USD_TYPES = {
     "string": ("string",),
     "filename": ("asset",),
     "surfaceshader": ("token",),
+    "displacementshader": ("token",),
 }
 
 
@@ -118,20 +120,27 @@ def _mesh_errors(prim: UsdGeom.Mesh) -> list[str]:
     points = np.array(prim.GetPointsAttr().Get())
     primvars = UsdGeom.PrimvarsAPI(prim)
     coordinates, normals = primvars.GetPrimvar("st"), primvars.GetPrimvar("normals")
-    if set(counts) != {3} or len(indices) != 3 * len(counts):
-        return [f"{path}: faces are not all triangles"]
+    smooth = prim.GetSubdivisionSchemeAttr().Get() == UsdGeom.Tokens.catmullClark
+    sides = 4 if smooth else 3
+    if set(counts) != {sides} or len(indices) != sides * len(counts):
+        return [f"{path}: faces are not all {'quads' if smooth else 'triangles'}"]
     errors = []
-    for primvar in (coordinates, normals):
+    if smooth and normals:
+        errors.append(f"{path}: normals of its own on a surface that subdivision makes")
+    for primvar in (coordinates,) if smooth else (coordinates, normals):
         if primvar.GetInterpolation() != UsdGeom.Tokens.faceVarying or len(primvar.GetIndices()) != len(
             indices
         ):
             errors.append(f"{primvar.GetAttr().GetPath()}: not one value per face corner")
-    faces, face_uvs = indices.reshape(-1, 3), np.array(coordinates.GetIndices()).reshape(-1, 3)
+    faces, face_uvs = (np.array(each).reshape(-1, sides) for each in (indices, coordinates.GetIndices()))
+    if smooth:
+        faces, face_uvs = triangulated(faces), triangulated(face_uvs)
     mesh = Mesh(points, faces, np.array(coordinates.Get()), face_uvs)
     errors += [f"{path}: {error}" for error in mesh_errors(mesh)]
-    lengths = np.linalg.norm(np.array(normals.Get()), axis=1)
-    if np.abs(lengths[np.unique(indices.clip(0, len(lengths) - 1))] - 1.0).max() > 1e-3:
-        errors.append(f"{path}: normals are not unit vectors")
+    if not smooth:
+        lengths = np.linalg.norm(np.array(normals.Get()), axis=1)
+        if np.abs(lengths[np.unique(indices.clip(0, len(lengths) - 1))] - 1.0).max() > 1e-3:
+            errors.append(f"{path}: normals are not unit vectors")
     extent = np.array(prim.GetExtentAttr().Get())
     if not np.allclose(extent, [points.min(0), points.max(0)], atol=1e-3):
         errors.append(f"{path}: extent does not enclose the points")

@@ -23,7 +23,7 @@ from pxr import UsdUtils
 
 from shared.errors import LimnError
 from shared.io.export_maps import MAPS, WORKING_SPACE, integer_codes
-from shared.io.images import write_exr, write_png
+from shared.io.images import texture_png, write_exr
 from shared.io.usd import HeadAsset, write_single_layer
 from shared.io.usd_material import SHADER_INPUTS, SRGB, TextureFile
 
@@ -37,7 +37,7 @@ _PADDING_ID = 0x1986
 def write_head_usdz(path: Path | str, asset: HeadAsset, maps: Mapping[str, np.ndarray], envmap: np.ndarray) -> None:
     """Packs the asset, its maps {name of export_maps.MAPS: [S, S] or [S, S, 3]} and envmap [H, W, 3], linear Rec.709.
 
-    The asset's own file names and the clip's pictures are left aside.
+    The asset's own file names, the clip's pictures and the displaced base are left aside: viewers do not displace.
     """
     with tempfile.TemporaryDirectory() as scratch:
         folder, textures = Path(scratch), {}
@@ -46,14 +46,14 @@ def write_head_usdz(path: Path | str, asset: HeadAsset, maps: Mapping[str, np.nd
             is_colour = MAPS[name][0] == "colour"
             if name in PNG_MAPS:
                 textures[name] = TextureFile(f"./maps/{name}.png", SRGB if is_colour else "data")
-                write_png(folder / textures[name].path, integer_codes(name, maps[name], 8))
+                (folder / textures[name].path).write_bytes(texture_png(integer_codes(name, maps[name], 8)))
             else:
                 textures[name] = TextureFile(f"./maps/{name}.exr")
                 write_exr(folder / textures[name].path, maps[name], colour_space="data", half=True)
         light = TextureFile("./envmap.exr", WORKING_SPACE)
         write_exr(folder / light.path, envmap, colour_space=WORKING_SPACE, half=True, latlong=True)
         layer = folder / "head.usdc"
-        write_single_layer(layer, replace(asset, maps=textures, envmap=light, plate=None))
+        write_single_layer(layer, replace(asset, maps=textures, envmap=light, plate=None, base=None))
         package = folder / "head.usdz"
         write_usdz(package, layer)
         shutil.move(package, path)

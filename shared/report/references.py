@@ -20,11 +20,15 @@ REFERENCES = {
     "Botsch2008":
         "Botsch, Sorkine, On Linear Variational Surface Deformation Methods. IEEE Transactions on Visualization and "
         "Computer Graphics 14, 2008.",
+    "Boubekeur2008": "Boubekeur, Alexa, Phong Tessellation. SIGGRAPH Asia 2008.",
     "Bouguet2000": "Bouguet, Pyramidal Implementation of the Lucas Kanade Feature Tracker. Intel Corporation, 2000.",
     "Bradski2000": "Bradski, The OpenCV Library. Dr. Dobb's Journal of Software Tools, 2000.",
     "Breiman1984": "Breiman et al., Classification and Regression Trees. Wadsworth, 1984.",
     "Burley2012": "Burley, Physically-Based Shading at Disney. SIGGRAPH courses, 2012.",
     "Carpenter1988": "Carpenter, Movements of the Eyes. Pion, 1988.",
+    "Catmull1978":
+        "Catmull, Clark, Recursively generated B-spline surfaces on arbitrary topological meshes. Computer-Aided "
+        "Design 10, 1978.",
     "Chen1992":
         "Chen, Medioni, Object modelling by registration of multiple range images. Image and Vision Computing 10, "
         "1992.",
@@ -48,6 +52,8 @@ REFERENCES = {
         "Golub, Pereyra, The Differentiation of Pseudo-Inverses and Nonlinear Least Squares Problems Whose Variables "
         "Separate. SIAM Journal on Numerical Analysis 10, 1973.",
     "Goral1984": "Goral et al., Modeling the Interaction of Light Between Diffuse Surfaces. SIGGRAPH 1984.",
+    "Halstead1993":
+        "Halstead, Kass, DeRose, Efficient, Fair Interpolation using Catmull-Clark Surfaces. SIGGRAPH 1993.",
     "Harris2020": "Harris et al., Array programming with NumPy. Nature 585, 2020.",
     "He2010": "He, Sun, Tang, Guided Image Filtering. ECCV 2010.",
     "He2015": "He, Sun, Fast Guided Filter. arXiv 1505.00996, 2015.",

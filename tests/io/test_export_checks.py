@@ -45,6 +45,11 @@ def half(count=MAP_SIZE, channels=()):
     return np.full((count, count, *channels), 0.5, np.float16)
 
 
+def displacement(folder, height):
+    write_exr(folder / "maps" / "displacement.exr", np.full((4, 4), height), colour_space="data", half=False,
+              attributes={"unit": "mm", "content": "displacement"})
+
+
 def mesh(change):
     def plant(folder):
         write_obj(folder / "mesh.obj", change(read_obj(folder / "mesh.obj")))
@@ -107,6 +112,8 @@ def nan_map(folder):
 
 
 FAULTS = [
+    ("maps/displacement.exr: values up to 12", lambda folder: displacement(folder, 12.0)),
+    ("maps/displacement.exr: values down to -12", lambda folder: displacement(folder, -12.0)),
     ("mesh.obj: missing", remove("mesh.obj")),
     ("mesh.obj: UVs leave the unit square", mesh(lambda m: m.replace(uvs=m.uvs + 0.5))),
     ("mesh.obj: 2 mm is not the size of a head", mesh(lambda m: m.replace(vertices=m.vertices * 0.01))),
@@ -163,6 +170,11 @@ def test_every_fault_is_named(export, words, plant):
     found = [str(fault) for fault in check_export(export).faults]
     assert any(fault.startswith(words) for fault in found), found
     assert all("\n" not in fault for fault in found)
+
+
+def test_a_displacement_need_not_have_the_size_of_the_other_maps(export):
+    displacement(export, -3.0)
+    assert check_export(export).faults == [] and (export / "maps" / "displacement.exr").is_file()
 
 
 def test_only_overlap_is_no_reason_to_withhold_a_result(export):
