@@ -10,7 +10,8 @@
       mtl/skin          Material: UsdPreviewSurface and OpenPBR; mtl/eye likewise
       capture           camera, lights and the clip's card, in the variant "clip" of the variant set "capture"
 
-    What a mesh is made of lies in the variants of the set "detail" (usd_detail).
+    What a mesh is made of lies in the variants of the set "detail" (usd_detail), what light does to the skin in those
+    of the set "look" (usd_material).
 
 The variant "clip" (the default) replays the capture: the head's (or the camera's) motion and the eyes' gaze as time
 samples, the light at rest, the clip on a card of purpose guide. The variant "still" leaves the head alone at head
@@ -57,7 +58,17 @@ from shared.io.usd_capture import (
     world_from_head_rigid,
 )
 from shared.io.usd_detail import BASE, DETAIL_SET, FULL, define_details, each_detail
-from shared.io.usd_material import EYE, EYE_MAPS, TextureFile, define_displacement, define_material
+from shared.io.usd_material import (
+    EYE,
+    EYE_MAPS,
+    LOOK_SET,
+    MEASURED,
+    SKIN_LOOK,
+    TextureFile,
+    define_displacement,
+    define_material,
+    define_scattering,
+)
 from shared.io.usd_variants import define_variants, in_variant
 
 METERS_PER_UNIT = 0.001
@@ -220,6 +231,8 @@ def _define_materials(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> Non
     if asset.base:
         with in_variant(stage.GetPrimAtPath(root), DETAIL_SET, BASE, FULL):
             define_displacement(stage, material, asset.base.heights)
+    with in_variant(stage.GetPrimAtPath(root), LOOK_SET, SKIN_LOOK, MEASURED):
+        define_scattering(stage, material)
     if asset.eyes:
         shared = {name: asset.maps[name] for name in EYE_MAPS if name in asset.maps}
         eye = define_material(stage, str(root.AppendPath("mtl/eye")), shared, EYE)
@@ -243,10 +256,12 @@ def _define_interface(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> Non
         "A head recovered from a clip by Limn. Lengths in millimetres; time codes are frames of the clip. "
         "Variant set 'capture': 'clip' replays the clip with its camera and light, 'still' is the head alone. "
         "Variant set 'detail': 'full', or about as many triangles as the name says, or 'base', quads under subdivision "
-        "whose displacement makes the full head of them."
+        "whose displacement makes the full head of them. "
+        "Variant set 'look': 'measured', or 'skin', into which light goes."
     )
     prim = stage.GetPrimAtPath(root)
     define_details(prim, asset.variants)
+    define_variants(prim, LOOK_SET, (MEASURED, SKIN_LOOK), MEASURED)
     model = Usd.ModelAPI(prim)
     model.SetKind(Kind.Tokens.component)
     model.SetAssetName(root.name)

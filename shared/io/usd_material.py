@@ -11,6 +11,9 @@ the map falls back to 1.5, intensity 1.
 Both models darken the diffuse layer by what the specular layer reflects (4 to 5 % at F0 = 0.04); Limn's BRDF
 does not.
 
+That is the look `measured`. The look `skin` lets the diffuse light into the head: what the clip tells of a surface is
+its albedo, not how far light goes below it, so that comes from measurements of skin [Jensen2001].
+
 Eyes share the map of the albedo; over it lies the tear film, one smooth dielectric. OpenPBR's coat would lay a second
 interface over that one.
 
@@ -28,6 +31,14 @@ from pxr import Gf, Sdf, Usd, UsdShade
 
 from shared.geometry.eyeballs import EYE_ROUGHNESS, TEAR_FILM_IOR
 
+LOOK_SET, MEASURED, SKIN_LOOK = "look", "measured", "skin"
+SKIN_MEAN_FREE_PATH_MM = (1.295, 0.952, 0.671)
+"""1 / (sigma_s' + sigma_a) in red, green and blue of the sample skin1 [Jensen2001]."""
+SEEN_LINEAR, SEEN_SQUARE = 0.8798, 0.1218
+"""What a thick medium whose OpenPBR colour is C shows under light from all sides, seen by a cosine of 0.8, about the
+mean one over a face from the front: a C + b C^2, to 0.001. From 1 - sqrt(1 - alpha) H(0.8) [Chandrasekhar1960], alpha
+of C as the specification has it. A medium is darker face on than along its surface, while a Lambertian surface is as
+bright from everywhere."""
 IOR = 1.5
 """Index of refraction whose F0, ((n - 1) / (n + 1))^2, is the 0.04 of the BRDF."""
 
@@ -103,6 +114,32 @@ def define_material(
     _preview_surface(stage, material, maps, finish)
     _open_pbr(stage, material, maps, finish)
     return material
+
+
+def define_scattering(stage: Usd.Stage, material: UsdShade.Material) -> None:
+    """Lets light into a material of define_material, as into skin: OpenPBR's subsurface in place of its diffuse base.
+
+    Its colour is inverted from the albedo A so that both look alike from the front: C with a C + b C^2 = A, which is
+    sqrt(A / b + k^2) - k with k = a / (2 b).
+    Reference: OpenPBR surface 1.1, Subsurface.
+    """
+    path, types = material.GetPath(), Sdf.ValueTypeNames
+    surface = UsdShade.Shader.Get(stage, path.AppendChild("openpbr_surface"))
+    albedo = UsdShade.Shader.Get(stage, path.AppendChild("openpbr_diffuse_albedo")).GetOutput("out")
+    half = 0.5 * SEEN_LINEAR / SEEN_SQUARE
+    for name, kind, number in (("scaled", "multiply", 1.0 / SEEN_SQUARE), ("raised", "add", half**2),
+                               ("root", "power", 0.5), ("inverted", "subtract", half)):
+        node = _shader(stage, material, f"openpbr_albedo_{name}", f"ND_{kind}_color3FA")
+        node.CreateInput("in1", types.Color3f).ConnectToSource(albedo)
+        node.CreateInput("in2", types.Float).Set(number)
+        albedo = node.CreateOutput("out", types.Color3f)
+    farthest = max(SKIN_MEAN_FREE_PATH_MM)
+    surface.CreateInput("subsurface_weight", types.Float).Set(1.0)
+    surface.CreateInput("subsurface_color", types.Color3f).ConnectToSource(albedo)
+    surface.CreateInput("subsurface_radius", types.Float).Set(farthest)
+    scale = Gf.Vec3f(*(own / farthest for own in SKIN_MEAN_FREE_PATH_MM))
+    surface.CreateInput("subsurface_radius_scale", types.Color3f).Set(scale)
+    surface.CreateInput("subsurface_scatter_anisotropy", types.Float).Set(0.0)
 
 
 def define_displacement(stage: Usd.Stage, material: UsdShade.Material, heights: TextureFile) -> None:

@@ -29,6 +29,7 @@ REFERENCES = {
     "Catmull1978":
         "Catmull, Clark, Recursively generated B-spline surfaces on arbitrary topological meshes. Computer-Aided "
         "Design 10, 1978.",
+    "Chandrasekhar1960": "Chandrasekhar, Radiative Transfer. Dover, 1960.",
     "Chen1992":
         "Chen, Medioni, Object modelling by registration of multiple range images. Image and Vision Computing 10, "
         "1992.",
@@ -65,6 +66,7 @@ REFERENCES = {
         "Irons, Tuck, A Version of the Aitken Accelerator for Computer Iteration. International Journal for Numerical "
         "Methods in Engineering 1, 1969.",
     "Jakob2022": "Jakob et al., Mitsuba 3 renderer. 2022.",
+    "Jensen2001": "Jensen et al., A Practical Model for Subsurface Light Transport. SIGGRAPH 2001.",
     "Kabsch1976":
         "Kabsch, A Solution for the Best Rotation to Relate Two Sets of Vectors. Acta Crystallographica A32, 1976.",
     "Kalal2010":
