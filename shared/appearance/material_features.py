@@ -1,4 +1,4 @@
-"""What tells skin from hair and cloth at a mesh's vertices: colour, texture and misfit, measured over a clip's frames.
+"""What tells skin from hair and cloth at a mesh's vertices: colour, texture and reduced chi-square over a clip's frames.
 
 All three are measured beside what typical skin would show at the same place in the same frame, so that light and
 shade cancel: how bright each channel is, how strongly the picture varies within a millimetre or two (strands, weave),
@@ -32,12 +32,12 @@ MOST_LOG = 4.0
 @dataclass(frozen=True)
 class SurfaceFeatures:
     """Of V vertices. colour [V, 3]: logarithm of the radiance over that of typical skin, mean over frames; texture [V]:
-    logarithm of the standard deviation of the log radiance within some mm of a picture; misfit [V]: logarithm of the
-    reduced chi-square of frames about `colour`; weight [V]: how many frames see it, by view cosine."""
+    logarithm of the standard deviation of the log radiance within some mm of a picture; chi_square [V]: logarithm of
+    the reduced chi-square of frames about `colour`; weight [V]: how many frames see it, by view cosine."""
 
     colour: np.ndarray
     texture: np.ndarray
-    misfit: np.ndarray
+    chi_square: np.ndarray
     weight: np.ndarray
 
 

@@ -38,7 +38,7 @@ CLOTH_BELOW_MM = (15.0, 45.0)
 LOWEST_CLOTH, LEAST_CLOTH = 0.6, 0.02
 """Its probability down there, and what is left of the table's above."""
 FLOOR = np.array([0.22, 0.07, 0.07, 0.32, 0.45])
-"""Least standard deviations of brightness, two differences of channels, texture and misfit."""
+"""Least standard deviations of brightness, two differences of channels, texture and reduced chi-square."""
 SKIN_SHARES = (0.5, 0.2, 0.1, 0.2)
 SKIN_SHIFTS = ((0.0,) * 5, (-0.1, 0, 0, 0.8, 1.2), (0.15, 0, 0, 0.3, 0.5), (-1.8, 0, 0, 0.5, 0.8))
 SKIN_FACTORS = ((1.0,) * 5, (1.6,) * 5, (1.3,) * 5, (5.0, 1.5, 1.5, 1.3, 2.0))
@@ -170,10 +170,10 @@ def _belief(prior: np.ndarray, values: np.ndarray, weight: np.ndarray, seen: np.
 
 
 def _descriptors(features: SurfaceFeatures) -> np.ndarray:
-    """[V, 5]: brightness, red over green, green over blue, texture, misfit."""
+    """[V, 5]: brightness, red over green, green over blue, texture, reduced chi-square."""
     colour = features.colour
     return np.stack([colour.mean(1), colour[:, 0] - colour[:, 1], colour[:, 1] - colour[:, 2], features.texture,
-                     features.misfit], 1)
+                     features.chi_square], 1)
 
 
 def _one_start(values: np.ndarray) -> Mixture:

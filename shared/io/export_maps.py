@@ -26,8 +26,8 @@ MAPS = {
 }
 DISPLACEMENT = "displacement"
 SOLVED_MAPS = tuple(name for name in MAPS if name not in ("material", "specular_ior", DISPLACEMENT))
-"""Those that inverse_render solves; specular_ior follows from specular_intensity, displacement from the mesh, and material
-tells skin from hair and others."""
+"""Those that inverse_render solves; specular_ior follows from specular_intensity, displacement from the mesh, material
+from what texels look like."""
 LARGEST_HEIGHT_MM = 10.0
 """A displacement beyond it joins what are different parts of a head."""
 _UP_TO_ONE = ("diffuse_albedo", "confidence", "normal", "roughness", "material")

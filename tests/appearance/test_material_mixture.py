@@ -21,17 +21,17 @@ def surface():
 
 
 def looks(surface, **regions):
-    """Features of a head whose regions {name: (which vertices, brightness, red over green, texture, misfit)} differ
+    """Features of a head whose regions {name: (which vertices, brightness, red over green, texture, chi_square)} differ
     from skin, with noise, seen from all sides."""
     rng, count = np.random.default_rng(0), len(surface.mesh.vertices)
-    colour, texture, misfit = rng.normal(0, 0.1, (count, 1)) + rng.normal(0, 0.02, (count, 3)), np.full(
+    colour, texture, chi_square = rng.normal(0, 0.1, (count, 1)) + rng.normal(0, 0.02, (count, 3)), np.full(
         count, -3.0), np.full(count, -1.0)
-    for inside, brightness, redder, more_texture, more_misfit in regions.values():
+    for inside, brightness, redder, more_texture, more_chi_square in regions.values():
         colour[inside] += brightness + np.array([0.5, -0.5, -0.5]) * redder
         texture[inside] += more_texture
-        misfit[inside] += more_misfit
+        chi_square[inside] += more_chi_square
     noise = rng.normal(0, 0.25, (2, count))
-    return SurfaceFeatures(colour, texture + noise[0], misfit + noise[1], np.full(count, 20.0))
+    return SurfaceFeatures(colour, texture + noise[0], chi_square + noise[1], np.full(count, 20.0))
 
 
 def union_share(found, truth):
