@@ -1,4 +1,4 @@
-"""What tells skin from hair and cloth at a mesh's vertices: colour, texture and reduced chi-square over a clip's frames.
+"""What tells skin from hair and cloth at a mesh's vertices: colour, texture, reduced chi-square over a clip's frames.
 
 All three are measured beside what typical skin would show at the same place in the same frame, so that light and
 shade cancel: how bright each channel is, how strongly the picture varies within a millimetre or two (strands, weave),
