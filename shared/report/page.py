@@ -1,4 +1,5 @@
-"""The report's page: one HTML file without any outside reference, filled from templates/report.html.j2.
+"""The report's page: one HTML file, filled from templates/report.html.j2, without any outside reference but links to
+what may be made beside it to show to others.
 
 What stands here turns arrays and records into what the template shows: pictures, charts and rows of text.
 """
@@ -35,6 +36,9 @@ from shared.report.viewer import ACTION_STEP_MM, WET, irradiance_harmonics, pack
 TEMPLATES = Path(__file__).with_name("templates")
 FRAME_PIXELS, MAP_PIXELS, LIGHT_PIXELS, OVERLAY_PIXELS = 440, 1024, 768, 1500
 VIEW_PIXELS, SHEET_PIXELS, VIEWER_TEXTURE_PIXELS = 512, 1600, 1024
+TURNTABLE = {"head_turns.mp4": "the head turning under three lights", "light_turns.mp4": "a light turning about it",
+             "maps.png": "a sheet of its maps"}
+"""What `limn turntable` writes into turntable/ beside the export."""
 _NOTHING = 90
 _MAP_TEXTS = {
     "diffuse_albedo": ("Diffuse albedo", "share of light that the skin scatters back"),
@@ -83,6 +87,7 @@ def report_html(content: ReportContent) -> str:
         "maps": [map_picture(name, np.asarray(values)) for name, values in content.maps.items()],
         "shape": _one(content.shape, SHEET_PIXELS, "the shape from three sides", _SHAPE),
         "views": view_pictures(content.views) if content.views else None,
+        "turntable": [(f"../turntable/{file}", text) for file, text in TURNTABLE.items()],
         "light_pictures": light_pictures(content.envmap),
         "chart": None if content.chart is None else Figure(jpeg_uri(content.chart), "the colour chart", text=_CHART),
         "motion_charts": motion_charts(content),

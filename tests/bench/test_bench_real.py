@@ -147,6 +147,7 @@ def test_regions_of_a_run_lie_in_its_head(tiny_run):
     for name in ("skin", "eyes", "lips"):
         pixels = item.regions[name]
         assert pixels.any() and not (pixels & ~item.regions["head"]).any()
+    assert item.regions["bare_skin"].any() and not (item.regions["bare_skin"] & ~item.regions["skin"]).any()
     assert not (item.regions["skin"] & item.regions["eyes"]).any() and shown[item.regions["head"]].all()
     albedo, relit = clip.albedo(clip.held_out[0]), clip.relit(clip.held_out[0])
     assert albedo[item.regions["skin"]].min() > 0.0 and relit[item.regions["skin"]].max() > 0.0

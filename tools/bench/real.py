@@ -50,13 +50,14 @@ NEEDS_A_LOOK = 3
 """Exit code of a run that misses a quality gate; it is a result."""
 SCORED_BY = ("tools/bench/real.py", "tools/bench/rerender.py", "tools/scoring/held_out.py", "tools/bench/whole_run.py",
              "tools/relight/inputs.py", "shared/rendering/views.py", "shared/rendering/render.py")  # fmt: skip
-REGION_COLUMNS = tuple(f"{region}_{kind}" for region in ("skin", "eyes", "lips", "head") for kind in
-                       ("db", "srgb_db", "ssim"))  # fmt: skip
+JUDGED = ("skin", "bare_skin", "eyes", "lips", "head")
+REGION_COLUMNS = tuple(f"{region}_{kind}" for region in JUDGED for kind in ("db", "srgb_db", "ssim"))
 COLUMNS = (
-    "case", "told", "frames", "held_out", *REGION_COLUMNS, "skin_pixels", "clipped_share", "detail", "tracked_detail",
-    "jitter_deg", "jitter_across_mm", "jitter_depth_mm", "tracked_jitter_deg", "roughness", "roughness_end", "specular",
-    "specular_end", "highlights_fitted", "reprojection_p95_px", "noise_factor", "focal_gain", "rotation_range_deg",
-    "fitted_residual", "held_out_residual", "wall_s", "cpu_s", "peak_mb", "warnings", "refused",
+    "case", "told", "frames", "held_out", *REGION_COLUMNS, "skin_pixels", "bare_skin_pixels", "clipped_share",
+    "detail", "tracked_detail", "jitter_deg", "jitter_across_mm", "jitter_depth_mm", "tracked_jitter_deg",
+    "roughness", "roughness_end", "specular", "specular_end", "highlights_fitted", "reprojection_p95_px",
+    "noise_factor", "focal_gain", "rotation_range_deg", "fitted_residual", "held_out_residual", "wall_s", "cpu_s",
+    "peak_mb", "warnings", "refused",
 )  # fmt: skip
 
 
@@ -107,7 +108,7 @@ def row_of(run: Path, sheet: Path) -> dict[str, object]:
     regions = region_errors(compared)
     return {
         "held_out": len(compared),
-        **{f"{region}_{kind}": regions.get(region, {}).get(kind) for region in ("skin", "eyes", "lips", "head")
+        **{f"{region}_{kind}": regions.get(region, {}).get(kind) for region in JUDGED
            for kind in ("db", "srgb_db", "ssim", "pixels")},
         "clipped_share": clip.clipped_share(),
         **detail_row(run),

@@ -17,11 +17,13 @@ from shared.geometry.raycast import camera_hits
 from shared.geometry.surface import Surface
 from shared.imaging.color import CLIPPED_CODE
 from shared.imaging.frame_index import spread_frames
+from shared.imaging.material_labels import SKIN
 from shared.imaging.texture import sample_bilinear
 from shared.imaging.turning_eyes import TurningEyes
 from shared.inverse.problem import FACE_SKIN
 from shared.io.arrays import load_arrays, read_json
 from shared.io.frames import FrameSet
+from shared.io.material_maps import read_material
 from shared.rendering.precomputed_transfer import Sizes
 from shared.rendering.studio_lights import studio_light
 from shared.rendering.views import HeadViews, ViewCamera, clip_camera
@@ -29,7 +31,8 @@ from tools.relight.inputs import Asset, open_asset
 from tools.scoring.held_out import HeldOutFrame
 
 REGIONS = {"skin": FACE_SKIN, "eyes": ("eyes", "eye_sockets", "lids"), "lips": ("lips", "inner_mouth")}
-"""Segments of each region; `head` is all that the mesh covers within the person mask."""
+"""Segments of each region; `head` is all that the mesh covers within the person mask, `bare_skin` what of the skin's
+segments the map of materials calls skin: no beard, and no hair that falls over a cheek."""
 SIZES = Sizes(directions=768, nodes=700)
 RELIT_UNDER = "low_sun"
 
@@ -57,6 +60,7 @@ class SolvedClip:
             raise InputError("the mesh has no face segments", where=str(work / "inverse_render" / "mesh.npz"))
         names = read_json(work / "track_landmarks" / "tracking.json")["segments"]
         self.segment_names = np.array(names)[segment]
+        self.is_skin = (read_material(work / "inverse_render" / "maps" / "material.exr").argmax(2) == SKIN)[..., None]
         cameras = [item.camera for item in self.held_out]
         turn = any(camera.gaze is not None for camera in cameras)
         eyes = TurningEyes.of(Surface(self.asset.mesh, segment, tuple(names))) if turn else None
@@ -75,7 +79,8 @@ class SolvedClip:
         """{region: [H, W] bool} of the pixels that count in a frame."""
         sure = filled_and_unclipped(self.frames.read_codes(item.place), self.frames.read_mask(item.place),
                                     self.views.coverage(item.camera))  # fmt: skip
-        return region_pixels(self.shown(item), sure)
+        found = region_pixels(self.shown(item), sure)
+        return found | {"bare_skin": found["skin"] & (self._texture(item, self.is_skin)[..., 0] > 0.5)}
 
     def shown(self, item: HeldOutCamera) -> np.ndarray:
         """[H, W] str: the segment that each pixel's centre shows, "" beside the head."""
@@ -90,16 +95,20 @@ class SolvedClip:
 
     def albedo(self, item: HeldOutCamera) -> np.ndarray:
         """[H, W, 3] linear: the albedo map as the camera sees it, 0 beside the head."""
-        face, bary = self._seen(item.camera)
-        hit, mesh = face >= 0, self.asset.mesh
-        picture = np.zeros((*face.shape, 3), np.float32)
-        place = interpolate(mesh.uvs, mesh.face_uvs, face[hit], bary[hit])
-        picture[hit] = sample_bilinear(self.asset.maps["diffuse_albedo"], place)
-        return picture
+        return self._texture(item, self.asset.maps["diffuse_albedo"])
 
     def relit(self, item: HeldOutCamera) -> np.ndarray:
         """[H, W, 3] linear: the head as the camera sees it under a studio light, 0 beside it."""
         return self.views.render(studio_light(RELIT_UNDER), [item.camera], "head", fade=False)[0]
+
+    def _texture(self, item: HeldOutCamera, texture: np.ndarray) -> np.ndarray:
+        """[H, W, C]: a texture [S, S, C] as the camera sees it, 0 beside the head."""
+        face, bary = self._seen(item.camera)
+        hit, mesh = face >= 0, self.asset.mesh
+        picture = np.zeros((*face.shape, texture.shape[2]), np.float32)
+        place = interpolate(mesh.uvs, mesh.face_uvs, face[hit], bary[hit])
+        picture[hit] = sample_bilinear(texture.astype(np.float32, copy=False), place)
+        return picture
 
     def _seen(self, camera: ViewCamera) -> tuple[np.ndarray, np.ndarray]:
         face, bary, _ = camera_hits(self.views.viewer.scene, camera.camera_from_head, camera.intrinsics, *camera.size)

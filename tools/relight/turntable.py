@@ -25,6 +25,7 @@ from shared.io.material_maps import read_material
 from shared.rendering.precomputed_transfer import Sizes
 from shared.rendering.studio_lights import studio_light
 from shared.rendering.views import HeadViews, ViewCamera, light_in_head_space, orbit_camera
+from shared.report.page import TURNTABLE
 from shared.report.pictures import srgb_bytes
 from tools.relight.inputs import Asset, open_asset, turned_head, turned_light
 from tools.relight.map_sheet import map_sheet
@@ -34,7 +35,8 @@ from tools.relight.video import write_video
 LIGHTS = ("window", "low_sun", "two_lamps")
 """Under which the head turns, from left to right."""
 TURNING_LIGHT = "low_sun"
-HEAD, LIGHT, SHEET, RECORD = "head_turns.mp4", "light_turns.mp4", "maps.png", "turntable.json"
+HEAD, LIGHT, SHEET = TURNTABLE
+RECORD = "turntable.json"
 RANGES = {"size": (64, 2048), "frames": (2, 2000), "fps": (1, 240)}
 _DIRECTIONS, _NODES = 768, 500
 _AT_ONCE = 8
