@@ -19,6 +19,7 @@ from shared.contract.hashing import hash_file
 from shared.contract.manifest import MANIFEST, PROVENANCE, RECORDS, make_work, write_record
 from shared.io.arrays import load_arrays
 from shared.io.images import read_exr, write_exr
+from shared.io.material_maps import read_material, write_material
 from tools.goldens.tiny import GOLDEN_FOLDER, SETTINGS, STAGES, TINY_SUBJECT, stage_folder
 
 _LEFT_OUT = {
@@ -53,6 +54,8 @@ def keep_outputs(run_folder: Path, stage: str) -> None:
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".npz":
             _pack(target / name, load_arrays(path))
+        elif path.stem == "material":
+            write_material(target / name, read_material(path), half=True, attributes={})
         elif path.suffix == ".exr":
             colour_space = "lin_rec709_scene" if stage == "init_albedo" or "maps" not in name else "data"
             image = read_exr(path).astype(np.float16)

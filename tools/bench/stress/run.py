@@ -21,7 +21,7 @@ from shared.contract.manifest import read_record
 from shared.contract.pipeline import Pipeline
 from shared.inverse.clip_inputs import read_inputs
 from shared.io.arrays import load_arrays
-from shared.io.images import read_exr
+from shared.io.export_maps import read_map
 from shared.io.meshes import load_mesh, write_obj
 from tools.cli.gates import Flag
 from tools.cli.measures import MEASURES
@@ -103,7 +103,7 @@ def scores_of(subject: Path, run: RunFolder) -> dict[str, float]:
     export = run.root / "export"
     found = score(subject, export)
     inputs = read_inputs(run.published("sample_frames"), run.published("track_landmarks"))
-    maps = {path.stem: read_exr(path) for path in (export / "maps").glob("*.exr")}
+    maps = {path.stem: read_map(path, path.stem) for path in (export / "maps").glob("*.exr")}
     mesh = load_mesh(run.published("inverse_render") / "mesh.npz")
     poses = final_poses(run.published("track_landmarks"), run.published("inverse_render"))
     errors = map_errors(subject, inputs, inputs.frame_index, mesh, maps)
