@@ -20,6 +20,7 @@ from shared.appearance.fit import fit_appearance
 from shared.appearance.problem import AppearanceProblem, AppearanceSettings
 from shared.errors import InputError
 from shared.io.images import write_exr
+from shared.io.material_maps import write_material
 from stages.inverse_render import check
 
 MATTE = AppearanceSettings(resolutions=(6,), steps=5, specular=False, noise=(0.003, 0.01))
@@ -128,6 +129,7 @@ def test_a_clip_that_shows_nothing_is_refused(tmp_path):
     for name in ("diffuse_albedo", "specular_intensity", "roughness", "normal", "confidence"):
         image = np.full((16, 16, 3) if name in ("diffuse_albedo", "normal") else (16, 16), 0.5, np.float32)
         write_exr(tmp_path / "maps" / f"{name}.exr", image, colour_space="data")
+    write_material(tmp_path / "maps" / "material.exr", np.full((16, 16, 7), 1.0 / 7.0), half=True, attributes={})
     (tmp_path / "solve.json").write_text(json.dumps({"seen_share_of_texels": 0.004}), encoding="utf-8")
     with pytest.raises(InputError, match="shows less than a hundredth.*film with more light"):
         check(SimpleNamespace(out=tmp_path, subject=SimpleNamespace(folder=tmp_path)))

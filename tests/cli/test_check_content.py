@@ -40,7 +40,7 @@ def test_a_sound_export_is_a_line(export, capsys):
     code, lines, faults = check(capsys, export)
     assert code == 0 and faults == []
     assert lines[0] == f"{export}: not checked: head.usdz (not in this export)"
-    assert lines[1].startswith(f"{export}: ") and "6 maps of 16 px" in lines[1] and len(lines) == 2
+    assert lines[1].startswith(f"{export}: ") and "7 maps of 16 px" in lines[1] and len(lines) == 2
     assert check(capsys, export.parent)[1] == check(capsys, export.parents[1])[1] == lines
 
 

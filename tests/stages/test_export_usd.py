@@ -40,7 +40,7 @@ from shared.io.meshes import read_obj
 from shared.io.usd import VARIANT_SET, VARIANT_STILL, prim_name
 from shared.io.usd_capture import BallLamp, UsdCapture, define_camera, define_dome_light, define_lamp
 from shared.io.usd_detail import DETAIL_SET, FULL
-from shared.io.usd_material import TextureFile, modulated_ior
+from shared.io.usd_material import LOOK_SET, TextureFile, modulated_ior
 from shared.io.usd_validate import package_errors, usd_errors
 from shared.io.usdz import write_usdz
 from shared.rendering.studio_lights import STUDIO_LIGHTS
@@ -365,7 +365,7 @@ def test_usdz_holds_the_same_asset(exported):
             other = second.GetAttribute(attribute.GetName())
             if attribute.GetTypeName() != Sdf.ValueTypeNames.Asset:
                 assert attribute.Get(float(FRAMES[2])) == other.Get(float(FRAMES[2])), attribute.GetPath()
-    assert set(packed.GetDefaultPrim().GetVariantSets().GetNames()) == {VARIANT_SET, DETAIL_SET}
+    assert set(packed.GetDefaultPrim().GetVariantSets().GetNames()) == {VARIANT_SET, DETAIL_SET, LOOK_SET}
     assert shader(packed, "preview_diffuse_albedo").GetInput("sourceColorSpace").Get() == "sRGB"
     with zipfile.ZipFile(exported["head"] / "head.usdz") as archive:
         codes = cv2.imdecode(np.frombuffer(archive.read("maps/diffuse_albedo.png"), np.uint8), cv2.IMREAD_UNCHANGED)
@@ -610,7 +610,7 @@ def test_levels_of_detail_can_be_left_out(work, exported, tmp_path):
     export_usd.check(job)
     for name in ("head.usda", "head.usdz"):
         plain, whole = (Usd.Stage.Open(str(folder / name)) for folder in (job.out, exported["head"]))
-        assert plain.GetDefaultPrim().GetVariantSets().GetNames() == [VARIANT_SET]
+        assert set(plain.GetDefaultPrim().GetVariantSets().GetNames()) == {VARIANT_SET, LOOK_SET}
         assert whole.GetDefaultPrim().GetVariantSet(DETAIL_SET).GetVariantSelection() == FULL
         points = [UsdGeom.Mesh(stage.GetDefaultPrim().GetPrimAtPath("geo/head")).GetPointsAttr().Get()
                   for stage in (plain, whole)]
