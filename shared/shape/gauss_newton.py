@@ -145,7 +145,8 @@ class Traced:
 
 
 class ShapeSolver:
-    """Refines a mesh and its subdivisions from views of it; tracks: what tracking knows of the surface, or None."""
+    """Refines a mesh and its subdivisions from views of it; tracks: what tracking knows of the surface, or None;
+    outline: what the face's edges in the views say of it, or None."""
 
     def __init__(
         self,
@@ -158,8 +159,7 @@ class ShapeSolver:
         context: RunContext = SILENT,
         outline: FaceOutline | None = None,
     ):
-        self.outline = outline
-        self.views, self.tracks, self.reflectance = views, tracks, reflectance
+        self.views, self.tracks, self.reflectance, self.outline = views, tracks, reflectance, outline
         self.appearance, self.sizes, self.settings, self.context = appearance, sizes, settings, context
 
     def trace(self, mesh: Mesh, shaped: np.ndarray) -> Traced:

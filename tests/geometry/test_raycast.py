@@ -93,6 +93,15 @@ def test_places_on_faces_lie_on_their_rays():
     np.testing.assert_allclose(places, origins + exact[:, None] * directions, atol=1e-11)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_ray_in_the_plane_of_its_face_meets_it_nowhere():
+    vertices, faces = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[0, 1, 2]])
+    origins, directions = np.array([[-1.0, 1, 0], [1, 1, -2]]), np.array([[1.0, 0, 0], [0, 0, 1]])
+    bary, distance = on_faces(vertices, faces, np.zeros(2, int), origins, directions)
+    assert np.isinf(distance[0]) and (bary[0] == 0.0).all()
+    assert distance[1] == 2.0 and bary[1].tolist() == [0.5, 0.25, 0.25]
+
+
 @pytest.mark.parametrize("code", ["sse2", "avx", "avx2"])
 def test_hits_are_the_same_bits_from_embrees_code_for_other_processors(code, monkeypatch):
     """Each has reciprocals of its own, which end in u, v and the distance that embree gives."""
