@@ -26,7 +26,7 @@ import numpy as np
 from shared.appearance.albedo_scale import ResolvedScale, most_likely_irradiance
 from shared.capture.chart import COLUMNS, CORNERS, GLARE_SIGMA, PATCHES, ChartObservation, reflectances
 from shared.geometry.raycast import RayScene
-from shared.geometry.transforms import WORLD_FROM_CAMERA, fibonacci_sphere, invert_rigid
+from shared.geometry.transforms import WORLD_FROM_CAMERA, fibonacci_sphere, invert_rigid, pixel_rays
 from shared.imaging.color import LUMINANCE
 from shared.rendering.envmap import cube_lookup
 
@@ -184,7 +184,7 @@ def _patch_places(corners: np.ndarray, normal: np.ndarray, intrinsics: np.ndarra
     from_grid = cv2.getPerspectiveTransform(CORNERS.astype(np.float32), corners.astype(np.float32))
     grid = np.stack(np.divmod(np.arange(PATCHES), COLUMNS)[::-1], 1) + 0.5
     pixels = cv2.perspectiveTransform(np.concatenate([grid, CORNERS[2:3] / 2]).reshape(-1, 1, 2), from_grid)[:, 0]
-    rays = np.column_stack([(pixels - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]], np.ones(PATCHES + 1)])
+    rays = pixel_rays(pixels, intrinsics)
     along = (rays[-1] @ normal) / (rays[:-1] @ normal)
     return np.concatenate([rays[:-1] * (along * (head_depth + depth))[:, None] for depth in DEPTHS_MM])
 

@@ -17,7 +17,7 @@ import scipy.sparse as sparse
 
 from shared.appearance.material_features import SurfaceFeatures
 from shared.compute.robust import ROBUST_SCALE
-from shared.geometry.mesh import mesh_edges, uniform_laplacian
+from shared.geometry.mesh import diffused, mesh_edges
 from shared.geometry.surface import Surface
 from shared.imaging.material_labels import BROW, CLOTH, EYE, HAIR, LABELS, LIPS, SKIN, UNKNOWN
 
@@ -225,10 +225,7 @@ def _spread(surface: Surface, values: np.ndarray, width_mm: float) -> np.ndarray
     """Vertex values [V, C] diffused over the surface by about width_mm."""
     mesh, edges = surface.mesh, mesh_edges(surface.mesh.faces)[0]
     step = np.median(np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1))
-    laplacian = uniform_laplacian(mesh.faces, len(mesh.vertices))
-    for _ in range(max(1, round((width_mm / step) ** 2))):
-        values = values - 0.5 * (laplacian @ values)
-    return values
+    return diffused(values, mesh.faces, max(1, round((width_mm / step) ** 2)))
 
 
 def _prior(surface: Surface) -> np.ndarray:

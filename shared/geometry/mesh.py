@@ -134,6 +134,15 @@ def uniform_laplacian(faces: np.ndarray, count: int) -> sparse.csr_matrix:
     return (sparse.identity(count) - sparse.diags(1.0 / degree) @ adjacency).tocsr()
 
 
+def diffused(values: np.ndarray, faces: np.ndarray, steps: int) -> np.ndarray:
+    """The vertices' values [V, ...] after so many steps, in each of which all go half of the way to their neighbours'
+    mean: spread over some sqrt(steps) edges. faces [F, 3]."""
+    laplacian = uniform_laplacian(faces, len(values))
+    for _ in range(steps):
+        values = values - 0.5 * (laplacian @ values)
+    return values
+
+
 def unique_pairs(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """[N, 2] indices -> distinct pairs [U, 2] in order, which of them each is [N], how often each occurs [U]."""
     count = int(pairs.max(initial=0)) + 1

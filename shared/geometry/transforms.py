@@ -58,6 +58,11 @@ def project(points: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.nda
     return pixels, depth
 
 
+def pixel_rays(pixels: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """[N, 3] directions in camera space with z = 1 through pixels [N, 2] of a picture with intrinsics [3, 3]."""
+    return np.column_stack([(pixels - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]], np.ones(len(pixels))])
+
+
 def projection_slope(points: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """[P, 2, 3]: derivative of the pixels by the points [P, 3] in head space, pose [4, 4]."""
     in_camera = points @ camera_from_head[:3, :3].T + camera_from_head[:3, 3]

@@ -20,7 +20,7 @@ from shared.appearance.projection import ROUGHNESS_RANGE, SPECULAR_RANGE, reache
 from shared.appearance.texture_pass import TexturePass
 from shared.capture.chart import ChartObservation
 from shared.compute.run_context import SILENT, RunContext
-from shared.geometry.mesh import uniform_laplacian
+from shared.geometry.mesh import diffused
 from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import TexelSurface
@@ -190,13 +190,9 @@ def scalp_of(surface: Surface) -> np.ndarray | None:
     None where the mesh has no segments."""
     if surface.face_segment is None:
         return None
-    mesh = surface.mesh
-    scalp = np.zeros(len(mesh.vertices))
-    scalp[mesh.faces[surface.faces_of(("scalp",))]] = 1.0
-    laplacian = uniform_laplacian(mesh.faces, len(scalp))
-    for _ in range(round((HAIRLINE_MM / typical_edge(mesh.vertices, mesh.faces)) ** 2)):
-        scalp -= 0.5 * (laplacian @ scalp)
-    return scalp > 0.5
+    faces = surface.mesh.faces
+    steps = round((HAIRLINE_MM / typical_edge(surface.mesh.vertices, faces)) ** 2)
+    return diffused(surface.vertices_of(("scalp",)).astype(float), faces, steps) > 0.5
 
 
 def specular_at(surface: TexelSurface, solution: Solution) -> float | np.ndarray:

@@ -67,8 +67,9 @@ def write_exr(
         with OpenEXR.File(header, _planes(pixels, channels)) as file:
             file.write(str(path))
     with OpenEXR.File(str(path)) as file:
+        stored = file.channels()
         for name, plane in _planes(pixels, channels).items():
-            if not np.array_equal(file.channels()[name].pixels, plane):
+            if not np.array_equal(stored[name].pixels, plane):
                 raise LimnError(f"{path}: the file does not read back as written")
 
 

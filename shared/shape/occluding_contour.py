@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ import scipy.sparse as sparse
 from shared.compute.robust import cauchy_weight
 from shared.geometry.mesh import Mesh, mesh_edges, normalised, vertex_normals
 from shared.geometry.raycast import RayScene
-from shared.geometry.transforms import project, projection_slope
+from shared.geometry.transforms import camera_centres, pixel_rays, project, projection_slope
 from shared.imaging.color import encode_srgb
 from shared.imaging.image_sampling import remap
 from shared.imaging.views import Views
@@ -32,6 +33,9 @@ BEYOND_PX, WITHIN_PX = 2.5, 1.5
 """How far outside of the outline a ray has to miss what the outline belongs to, and inside of it has to meet it."""
 BEHIND_MM, ROUND_MM = 3.0, 25.0
 """What lies so far behind a point of the contour is something else; the surface inside of it bulges so far at most."""
+
+FACING = 0.5
+"""Cosine from which on skin faces the camera well enough to say what its usual code is."""
 
 
 @dataclass(frozen=True)
@@ -145,46 +149,50 @@ def occluding_contour(
     known_mm = outlined.vertices_known_mm(mesh)
     parts, met, count = [], 0, 0
     for f, (pose, lens) in enumerate(zip(views.camera_from_head, views.intrinsics, strict=True)):
-        turning, share, outward, free = _turning_points(mesh, normals, edges, scene, pose, lens)
-        points = _between(mesh.vertices, turning, share)
-        pixels, depth = project(points, pose, lens)
+        cosine = (normalised(camera_centres(pose) - mesh.vertices) * normals).sum(1)
+        turning = _turning_points(mesh, normals, cosine, edges, scene, pose, lens)
+        pixels, outward = turning.pixels, turning.outward
         inside = ((pixels > 1.0) & (pixels < np.array(views.size) - 1.0)).all(1)
-        px_per_mm = lens[0, 0] / depth
+        px_per_mm = lens[0, 0] / turning.depth
         apart = remap(outlines.distances[f], pixels).astype(np.float64)
-        near = inside & free & (np.abs(apart) < settings.reach_mm * px_per_mm)
-        met, count = met + int(near.sum()), count + int((inside & free).sum())
+        near = inside & turning.free & (np.abs(apart) < settings.reach_mm * px_per_mm)
+        met, count = met + int(near.sum()), count + int((inside & turning.free).sum())
         on_edge = np.zeros(len(apart), bool)
-        sought = np.nonzero(inside & of_face[turning].all(1))[0]
+        sought = np.nonzero(inside & of_face[turning.edge].all(1))[0]
         if len(sought):
-            reach_mm = np.minimum(SIGMAS_OFF * known_mm[turning[sought]].min(1), settings.edge_reach_mm)
-            skin = _usual_code(outlines.codes[f], mesh.vertices[bare], normals[bare], pose, lens)
+            reach_mm = np.minimum(SIGMAS_OFF * known_mm[turning.edge[sought]].min(1), settings.edge_reach_mm)
+            facing = mesh.vertices[bare[cosine[bare] > FACING]]
+            skin = np.median(remap(outlines.codes[f], project(facing, pose, lens)[0]), axis=0).astype(np.float64)
             reach_px = reach_mm * px_per_mm[sought]
             edge = face_edges(outlines.codes[f], pixels[sought], outward[sought], reach_px, skin)
             beside = remap(outlines.distances[f], pixels[sought] + np.nan_to_num(edge)[:, None] * outward[sought])
             farthest = OUTSIDE_SIGMAS * settings.sigma_px
-            own = np.isfinite(edge) & (beside < farthest) & ((beside > -farthest) | ~(free[sought] & bordered))
+            own = np.isfinite(edge) & (beside < farthest) & ((beside > -farthest) | ~(turning.free[sought] & bordered))
             apart[sought[own]], on_edge[sought[own]] = -edge[own], True
         near = near & bordered | on_edge
-        slope = np.einsum("nix,ni->nx", projection_slope(points, pose, lens), outward)
-        parts.append((np.full(near.sum(), f), *(values[near] for values in (turning, share, slope, apart, on_edge))))
+        values = turning.edge, turning.share, turning.slope, apart, on_edge
+        parts.append((np.full(near.sum(), f), *(value[near] for value in values)))
     arrays = [np.concatenate(part) for part in zip(*parts, strict=True)]
     return OccludingContour(*arrays, met=met / max(count, 1))
 
 
-def _usual_code(codes, vertices, normals, pose, intrinsics) -> np.ndarray:
-    """Median [3] of a picture's codes at the vertices [n, 3] that face the camera."""
-    centre = -pose[:3, 3] @ pose[:3, :3]
-    facing = (normalised(centre - vertices) * normals).sum(1) > 0.5
-    return np.median(remap(codes, project(vertices[facing], pose, intrinsics)[0]), axis=0).astype(np.float64)
+class _TurningPoints(NamedTuple):
+    """Where an outline in sight crosses edges [n, 2] of the mesh, at a share [n] of the way; pixels [n, 2], depth [n]
+    mm, the outward direction in the picture [n, 2], the slope [n, 3] of a place along it by the point's, px per mm, and
+    free [n] bool: nothing of the mesh lies beyond."""
+
+    edge: np.ndarray
+    share: np.ndarray
+    pixels: np.ndarray
+    depth: np.ndarray
+    outward: np.ndarray
+    slope: np.ndarray
+    free: np.ndarray
 
 
-def _turning_points(
-    mesh, normals, edges, scene, pose, intrinsics
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of the edges [E, 2] those that an outline in sight crosses [n, 2], the share of the way where [n], the outward
-    direction in the picture [n, 2], and whether nothing of the mesh lies beyond [n] bool."""
-    centre = -pose[:3, 3] @ pose[:3, :3]
-    cosine = (normalised(centre - mesh.vertices) * normals).sum(1)
+def _turning_points(mesh, normals, cosine, edges, scene, pose, intrinsics) -> _TurningPoints:
+    """Of the edges [E, 2] those that an outline in sight crosses; cosine [V]: between normals and the way to the
+    camera."""
     turning = edges[cosine[edges[:, 0]] * cosine[edges[:, 1]] < 0]
     share = cosine[turning[:, 0]] / (cosine[turning[:, 0]] - cosine[turning[:, 1]])
     points, across = (_between(values, turning, share) for values in (mesh.vertices, normals))
@@ -194,14 +202,14 @@ def _turning_points(
 
     def seen(pixels: np.ndarray) -> np.ndarray:
         """Depth [n] of the mesh, infinite beside it."""
-        rays = (pixels - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]]
-        rays = np.concatenate([rays, np.ones((len(pixels), 1))], axis=1) @ pose[:3, :3]
-        return scene.intersect(np.broadcast_to(centre, rays.shape), rays)[2]
+        rays = pixel_rays(pixels, intrinsics) @ pose[:3, :3]
+        return scene.intersect(np.broadcast_to(camera_centres(pose), rays.shape), rays)[2]
 
     within, beyond = seen(pixels - WITHIN_PX * outward), seen(pixels + BEYOND_PX * outward)
     free = np.isinf(beyond)
     own = free | (within > depth - ROUND_MM) & (within < depth + BEHIND_MM) & (beyond > depth + BEHIND_MM)
-    return turning[own], share[own], outward[own], free[own]
+    parts = turning, share, pixels, depth, outward, np.einsum("nix,ni->nx", slope, outward), free
+    return _TurningPoints(*(part[own] for part in parts))
 
 
 def _between(values: np.ndarray, edges: np.ndarray, share: np.ndarray) -> np.ndarray:

@@ -13,7 +13,14 @@ from scipy.ndimage import map_coordinates
 
 from shared.capture.chart import COLUMNS, CORNERS, PATCHES, ROWS, reflectances
 from shared.geometry.raycast import RayScene
-from shared.geometry.transforms import camera_centres, fibonacci_sphere, project, rigid, rotation_from_vector
+from shared.geometry.transforms import (
+    camera_centres,
+    fibonacci_sphere,
+    pixel_rays,
+    project,
+    rigid,
+    rotation_from_vector,
+)
 from shared.imaging.texture import sample_bilinear
 from tools.synthesis.irradiance import SyntheticShot
 from tools.synthesis.light import EnvironmentLight
@@ -80,7 +87,7 @@ def add_chart(picture: np.ndarray, chart: PlacedChart, surface: SyntheticSurface
 def _shade(chart: PlacedChart, head: RayScene, white: np.ndarray, shot: SyntheticShot, intrinsics: np.ndarray,
            pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Image points [N, 2] -> bool [N], whether the chart is seen there, and its radiance [N, 3] (0 elsewhere)."""
-    rays = np.column_stack([(pixels - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]], np.ones(len(pixels))])
+    rays = pixel_rays(pixels, intrinsics)
     rotation, origin = chart.camera_from_chart[:3, :3], chart.camera_from_chart[:3, 3]
     normal = rotation[:, 2]
     depth = (origin @ normal) / (rays @ normal)
