@@ -198,7 +198,7 @@ def resolve_scale(
 
     def on_highlights(log_factor: np.ndarray, log_intensity: float) -> np.ndarray:
         amplitude = (np.exp(log_intensity + log_factor) - highlights.intensity) / spread
-        robust = np.sign(amplitude) * np.sqrt(np.log1p(amplitude**2))
+        robust = np.sign(amplitude) * np.sqrt(2.0 * (np.sqrt(1.0 + amplitude**2) - 1.0))
         return np.append(robust, (log_intensity - np.log(mean)) / sigma)
 
     def jointly(x: np.ndarray) -> np.ndarray:
@@ -213,7 +213,8 @@ def resolve_scale(
 
 def _highlight_spread(highlights: Highlights, mean_intensity: float) -> np.ndarray:
     """Standard deviation [3] of the intensities: the diffuse model's errors and, where highlights are faint or few,
-    what the samples leave open. Beyond it the loss is Cauchy's: channels that contradict skin have met something else.
+    what the samples leave open. Beyond it the loss is pseudo-Huber: channels that contradict skin have met something
+    else, and yet there is one answer only, which moves by a little where the highlights do.
     """
     relative = HIGHLIGHT_SIGMA * highlights.diffuse_share / highlights.diffuse_share.mean()
     modelled = (relative * np.maximum(highlights.intensity, mean_intensity)) ** 2

@@ -155,3 +155,16 @@ def test_wide_highlights_do_not_darken_skin_beside_bright_whites():
     beside, intensity, *_ = resolve_scale(skin, np.zeros(3), strong, (0.7, 0.25), whites=whites)
     assert (without > 0.5).all() and (0.0 < beside).all() and (beside < 0.75 * without).all()
     assert intensity > 0.7
+
+
+def test_highlights_that_contradict_the_whites_move_the_scale_by_little_at_a_time():
+    """With two answers that are about as likely each step of the light would take the other."""
+    skin = np.log(np.median(REFERENCE_SKINS, axis=0))
+    whites = np.full(3, -0.5), 0.33**2 + 0.5 * 0.15**2 * np.eye(3)
+
+    def resolved(strength: float) -> float:
+        found = Highlights(np.full(3, strength), np.full(3, 200.0), np.full(3, 10.0))
+        return resolve_scale(skin - 0.2, np.zeros(3), found, (0.7, 0.25), whites=whites)[0].mean()
+
+    moved = np.diff([resolved(strength) for strength in np.arange(0.7, 2.0, 0.02)])
+    assert (0.0 < moved).all() and (moved < 0.02).all()
