@@ -27,7 +27,7 @@ from shared.errors import LimnError
 
 STAGE = Stage(
     name="export_usd",
-    version=10,
+    version=11,
     help="The head as USD, glTF, OBJ and EXR, with a report to judge it by.",
     inputs=("sample_frames", "track_landmarks", "init_albedo", "inverse_render"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -38,9 +38,10 @@ STAGE = Stage(
         Output("head_geo.usdc", "the mesh and its blend shapes, in full and reduced; head and eyes where the gaze is "
                "known", unit="mm", space="head"),
         Output("head_mtl.usda", "the materials"),
-        Output("head.usdz", "all of head.usda and its textures in one file; absent when usdz is off", optional=True),
-        Output("head.glb", "mesh, morph targets, textures, lens and motion as binary glTF; absent when glb is off",
-               unit="m", optional=True),
+        Output("head.usdz", "head.usda and its textures in one file, with fewer faces; absent when usdz is off",
+               optional=True),
+        Output("head.glb", "the same as binary glTF: mesh, morph targets, textures, lens, motion; absent when glb is "
+               "off", unit="m", optional=True),
         Output("mesh.obj", "the mesh with its UVs; groups for head and eyes", unit="mm", space="head"),
         Output("maps/*.exr", "texture maps, v up", space="uv", colour_space="in each file"),
         Output("maps/png/*.png", "integer copies of the maps; absent unless png_copies", space="uv", optional=True),
@@ -72,6 +73,8 @@ STAGE = Stage(
         Parameter("actions", bool, True, "Also write facial actions as blend shapes, if the mesh is the head model's."),
         Parameter("detail", bool, True, "Also write meshes of 20,000 and 5,000 faces, variants of the asset, and quads "
                   "with a displacement map if the mesh is the head model's."),
+        Parameter("viewer_detail", str, "20k", "Faces of the mesh in head.glb, and of the finest one in head.usdz.",
+                  choices=("full", "20k", "5k")),
         Parameter("plates", bool, True, "Also write the clip's frames, shown behind the head in USD as a guide."),
         Parameter("views", bool, True, "Also render the head from the side and under other lights."),
         Parameter("view_size", int, 512, "Edge of those pictures.", "px", 64, 4096),
@@ -113,6 +116,7 @@ def find_actions(job: Job, surface) -> tuple[tuple, dict]:
     """The facial actions as blend shapes of the mesh, and what run.json says of them; nothing when switched off."""
     from shared.actions.facial import facial_actions
     from shared.actions.names import lacking_names
+    from shared.geometry.blend_shapes import with_normals
     from shared.tracking.models import load_head_model
 
     if not job.params.actions:
@@ -120,6 +124,7 @@ def find_actions(job: Job, surface) -> tuple[tuple, dict]:
     shapes = ()
     if surface.face_segment is not None:
         shapes = facial_actions(load_head_model(), surface.mesh.vertices, surface.mesh.faces)
+        shapes = with_normals(shapes, surface.mesh)
     names = [shape.name for shape in shapes]
     note = "" if names else "the mesh is not the head model's: it has no facial actions"
     return shapes, {"names": names, "lacking": lacking_names(tuple(names)), "note": note}
@@ -187,11 +192,12 @@ def near_lamp(solve: dict):
 
 
 def describe_asset(job: Job, mesh, eyes, actions, details, base, capture, frames, writer, lamp):
-    """The asset that head.usda and head.usdz hold; writes the plates. actions: its blend shapes; details: {variant: the
-    mesh with fewer faces}; base: the mesh as displaced quads, or None; lamp: what stands near of the light, or None."""
+    """The asset that head.usda holds; writes the plates. actions: its blend shapes; details: {level: the mesh with
+    fewer faces}; base: the mesh as displaced quads, or None; lamp: what stands near of the light, or None."""
     from shared.io.plates import crop_rectangle, write_plates
     from shared.io.usd import HeadAsset
     from shared.io.usd_capture import Plate
+    from shared.io.usd_detail import BASE, FULL
     from shared.io.usd_material import SHADER_INPUTS, TextureFile
 
     plate = None
@@ -209,27 +215,33 @@ def describe_asset(job: Job, mesh, eyes, actions, details, base, capture, frames
         "confidence_map": f"maps/{writer.file_name('confidence')}",
     }
     light = TextureFile("./envmap.exr" if lamp is None else "./envmap_far.exr", writer.colour_space)
-    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, lamp, eyes, actions, details, base,
+    levels = (FULL, *details, *([BASE] if base else ())) if job.params.detail else (FULL,)
+    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, lamp, eyes, actions, details, base, levels,
                      version=str(STAGE.version), metadata=metadata)
 
 
 def write_assets(job: Job, asset, eyeballs, poses: dict, maps: dict, envmap) -> None:
-    """mesh.obj, poses.npz, head.usda and its layers; when wished, head.usdz and head.glb. eyeballs: the groups of
-    mesh.obj beside the head's; envmap [H, 2 H, 3]: what the asset's dome shows, linear Rec.709."""
+    """mesh.obj, poses.npz, head.usda and its layers; when wished, head.usdz and head.glb, with as many faces as
+    viewer_detail says. eyeballs: the groups of mesh.obj beside the head's; envmap [H, 2 H, 3]: what the asset's dome
+    shows, linear Rec.709."""
     from shared.io.arrays import save_arrays
     from shared.io.gltf import write_glb
     from shared.io.meshes import write_obj
     from shared.io.usd import write_head_usda
+    from shared.io.usd_detail import FULL
     from shared.io.usdz import write_head_usdz
 
     write_obj(job.out / "mesh.obj", asset.mesh, eyeballs)
-    kept = ("camera_from_head", "frame_index", "intrinsics", "gaze", "gain")
+    kept = ("camera_from_head", "frame_index", "intrinsics", "gaze", "eye_turn", "gain")
     save_arrays(job.out / "poses.npz", **{name: poses[name] for name in kept if name in poses})
     write_head_usda(job.out, asset)
+    finest = job.params.viewer_detail
     if job.params.usdz:
-        write_head_usdz(job.out / "head.usdz", asset, maps, envmap)
+        levels = (FULL, *asset.details)
+        coarser = levels[levels.index(finest):] if job.params.detail else (finest,)
+        write_head_usdz(job.out / "head.usdz", asset, coarser, maps, envmap)
     if job.params.glb:
-        write_glb(job.out / "head.glb", asset.name, asset.mesh, maps, asset.capture, asset.eyes, asset.actions)
+        write_glb(job.out / "head.glb", asset.name, asset.parts(finest), maps, asset.capture, asset.actions)
 
 
 def light_moves(job: Job, moves: str) -> str:
@@ -381,9 +393,8 @@ def run(job: Job) -> None:
     eyeballs = eyeballs_of(surface) or ()
     eyes = eyeballs if "eye_turn" in poses else ()
     actions, said_of_them = find_actions(job, surface)
-    wanted = REDUCED_FACES if params.detail else {PAGE_DETAIL: REDUCED_FACES[PAGE_DETAIL]}
-    details = dict(zip(wanted, reduced(surface, tuple(wanted.values())), strict=True))
-    asset = describe_asset(job, mesh, eyes, actions, details if params.detail else {}, find_base(job, surface, writer),
+    details = dict(zip(REDUCED_FACES, reduced(surface, tuple(REDUCED_FACES.values())), strict=True))
+    asset = describe_asset(job, mesh, eyes, actions, details, find_base(job, surface, writer),
                            describe_capture(job, poses, frames), frames, writer, lamp)
     write_assets(job, asset, eyeballs, poses, maps, far)
     views = render_views(job, writer, mesh, eyes, maps, envmap, poses, frames, solve)

@@ -372,7 +372,7 @@ SOLVE = (
 
 SELECTION_TIMES = (Field("[]", "Seconds of each entry of `model_selection` in solve.json, in order.", unit="s"),)
 
-EXPORTED_POSES = (POSES, FRAME_INDEX, SOURCE_LENS, GAZE, GAIN)
+EXPORTED_POSES = (POSES, FRAME_INDEX, SOURCE_LENS, GAZE, EYE_TURN, GAIN)
 _STAGE_RECORD = (
     Field("version", "The stage's version.", "int"),
     Field("parameters.**", "Its parameters as used.", ""),

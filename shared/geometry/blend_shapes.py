@@ -1,21 +1,26 @@
-"""Blend shapes: how a mesh's vertices move as one action goes from nothing, 0, to all of it, 1."""
+"""Blend shapes: how a mesh's vertices move and normals move as one action goes from nothing, 0, to all, 1."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+
+from shared.geometry.mesh import Mesh, shading_normals, vertex_normals
 
 
 @dataclass(frozen=True, eq=False)
 class BlendShape:
     """vertices [n] int, in order: those that move; offsets [n, 3] float32 mm at weight 1. between: (weight in (0, 1),
-    offsets [n, 3]) in order, in-betweens where the way there is not straight."""
+    offsets [n, 3]) in order, in-betweens where the way there is not straight. normals [1 + k, n, 3] float32: what is
+    added to unit normals at weight 1, then at each of k in-betweens; None where that is not known."""
 
     name: str
     vertices: np.ndarray
     offsets: np.ndarray
     between: tuple[tuple[float, np.ndarray], ...] = ()
+    normals: np.ndarray | None = None
 
     @classmethod
     def of(
@@ -44,11 +49,29 @@ class BlendShape:
         moved[self.vertices] += self.at(weight)
         return moved
 
-    def of_part(self, part: np.ndarray, count: int) -> BlendShape:
-        """The same for a mesh of the vertices part [m] alone, out of count: its first vertex is part[0]."""
-        place = np.full(count, -1)
+    def of_part(self, part: np.ndarray) -> BlendShape:
+        """The same for a mesh of the vertices part [m] alone: its first vertex is part[0]."""
+        place = np.full(max(part.max(initial=0), self.vertices.max(initial=0)) + 1, -1)
         place[part] = np.arange(len(part))
         moved = place[self.vertices]
         order = np.argsort(moved)[np.count_nonzero(moved < 0):]
         return replace(self, vertices=moved[order].astype(np.int32), offsets=self.offsets[order],
-                       between=tuple((weight, own[order]) for weight, own in self.between))
+                       between=tuple((weight, own[order]) for weight, own in self.between),
+                       normals=None if self.normals is None else self.normals[:, order])
+
+
+def with_normals(shapes: Sequence[BlendShape], mesh: Mesh) -> tuple[BlendShape, ...]:
+    """The shapes of a mesh with what they add to its shading normals; nothing where the faces around a moved vertex
+    lose their area."""
+    rest, found = shading_normals(mesh), []
+    for shape in shapes:
+        moving = np.zeros(len(mesh.vertices), bool)
+        moving[shape.vertices] = True
+        faces, before, added = mesh.faces[moving[mesh.faces].any(1)], rest[shape.vertices], []
+        for offsets in (shape.offsets, *(own for _, own in shape.between)):
+            moved = np.array(mesh.vertices, np.float64)
+            moved[shape.vertices] += offsets
+            after = vertex_normals(moved, faces)[shape.vertices]
+            added.append(np.where(np.abs(after).max(1, keepdims=True) > 0.0, after - before, 0.0))
+        found.append(replace(shape, normals=np.array(added, np.float32)))
+    return tuple(found)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.geometry.mesh import normalised
+from shared.geometry.mesh import Mesh, normalised
 from shared.geometry.surface import Surface
 
 SIDES = ("right", "left")
@@ -43,12 +43,13 @@ def eyeballs_of(surface: Surface) -> tuple[Eyeball, Eyeball] | None:
     right = surface.mesh.vertices[corners[:, 0], 0] < 0
     if not right.any() or right.all():
         return None
-    return tuple(_eyeball(surface.mesh.vertices, corners[own], faces[own]) for own in (right, ~right))
+    return tuple(fit_eyeball(surface.mesh, faces[own]) for own in (right, ~right))
 
 
-def _eyeball(vertices: np.ndarray, corners: np.ndarray, faces: np.ndarray) -> Eyeball:
-    own = np.unique(corners)
-    centre, radius = fit_sphere(vertices[own])
+def fit_eyeball(mesh: Mesh, faces: np.ndarray) -> Eyeball:
+    """The eyeball that faces [m] int of the mesh are."""
+    own = np.unique(mesh.faces[faces])
+    centre, radius = fit_sphere(mesh.vertices[own])
     return Eyeball(own, faces, centre, radius)
 
 

@@ -7,9 +7,9 @@ the format cannot say: a shifted principal point and an environment light; both 
 Eyeballs that are known are nodes of their own below the head's: their centre is the node's place, the gaze its
 rotation, and without the animation they look straight ahead.
 
-Facial actions are morph targets, sparse, named in the mesh's extras as exporters agreed on. glTF goes straight from 0
-to 1: an in-between is a target of its own after all others, the difference from that straight way. `eyeBlinkLeft_50`
-belongs to `eyeBlinkLeft`: with weight 1 - |2 w - 1| where that one has w.
+Facial actions are morph targets of places and normals, sparse, named in the mesh's extras as exporters agreed on. glTF
+goes straight from 0 to 1: an in-between is a target of its own after all others, the difference from that straight way.
+`eyeBlinkLeft_50` belongs to `eyeBlinkLeft`: with weight 1 - |2 w - 1| where that one has w.
 
 References: glTF 2.0 specification (GLB container, accessors, animations); KHR_materials_specular (F0 = min(0.04 *
 specularColor, 1) * specular); KHR_materials_ior.
@@ -19,16 +19,16 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from shared.geometry.blend_shapes import BlendShape
-from shared.geometry.eyeballs import EYE_ROUGHNESS, TEAR_FILM_IOR, Eyeball
-from shared.geometry.mesh import Mesh, unique_pairs
-from shared.geometry.parts import HEAD, RigidPart, head_parts
+from shared.geometry.eyeballs import EYE_ROUGHNESS, TEAR_FILM_IOR
+from shared.geometry.mesh import unique_pairs
+from shared.geometry.parts import HEAD, RigidPart
 from shared.io.export_maps import integer_codes
 from shared.io.images import texture_png
 from shared.io.usd_capture import UsdCapture, eye_turns, world_from_head_rigid, world_from_usd_camera
@@ -76,50 +76,50 @@ class _Buffer:
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
-    def sparse(self, count: int, index: np.ndarray, values: np.ndarray) -> int:
-        """count vectors of 0 but those at index [n], in order, which are values [n, 3] -> index of the accessor."""
-        values, short = np.ascontiguousarray(values, "<f4"), index.max(initial=0) < 2**16
-        self.accessors.append({
-            "componentType": _FLOAT,
-            "count": count,
-            "type": _KINDS[3],
-            "min": np.minimum(values.min(0), 0.0).tolist(),
-            "max": np.maximum(values.max(0), 0.0).tolist(),
-            "sparse": {
-                "count": len(index),
-                "indices": {"bufferView": self.add(index.astype("<u2" if short else "<u4").tobytes()),
-                            "componentType": _USHORT if short else _UINT},
-                "values": {"bufferView": self.add(values.tobytes())},
-            },
-        })
-        return len(self.accessors) - 1
+    def sparse(self, count: int, index: np.ndarray, *each: np.ndarray) -> list[int]:
+        """For each of the values [n, 3], count vectors of 0 but those at index [n], in order, which are these
+        -> indices of the accessors."""
+        short = index.max(initial=0) < 2**16
+        indices = {"bufferView": self.add(index.astype("<u2" if short else "<u4").tobytes()),
+                   "componentType": _USHORT if short else _UINT}
+        for values in each:
+            values = np.ascontiguousarray(values, "<f4")
+            self.accessors.append({
+                "componentType": _FLOAT,
+                "count": count,
+                "type": _KINDS[3],
+                "min": np.minimum(values.min(0), 0.0).tolist(),
+                "max": np.maximum(values.max(0), 0.0).tolist(),
+                "sparse": {"count": len(index), "indices": indices,
+                           "values": {"bufferView": self.add(values.tobytes())}},
+            })
+        return list(range(len(self.accessors) - len(each), len(self.accessors)))
 
 
 def write_glb(
     path: Path | str,
     name: str,
-    mesh: Mesh,
+    parts: Sequence[RigidPart],
     maps: Mapping[str, np.ndarray],
     capture: UsdCapture,
-    eyes: Sequence[Eyeball] = (),
     actions: Sequence[BlendShape] = (),
 ) -> None:
-    """One file with all inside. maps: diffuse_albedo, specular_intensity, roughness and normal, as exported; eyes: the
-    right and the left eyeball of the mesh, to be nodes of their own, or none; actions: blend shapes of the mesh, which
-    move no eyeball."""
+    """One file with all inside. parts: the head, then the eyeballs that are to be nodes of their own, as head_parts has
+    them; maps: diffuse_albedo, specular_intensity, roughness and normal, as exported; actions: blend shapes of the
+    whole mesh, which move no eyeball."""
     buffer = _Buffer()
     textures, skin = _material(buffer, maps)
     width, height = capture.width, capture.height
-    head, *turning = head_parts(mesh, eyes)
+    head, *turning = parts
     nodes = [{"name": HEAD, "mesh": 0}, {"name": "camera", "camera": 0}]
     if turning:
         nodes[0]["children"] = [_FIRST_EYE + k for k in range(len(turning))]
         nodes += [{"name": eye.name, "mesh": 1 + k, "translation": (eye.pivot * METRES_PER_MM).tolist()}
                   for k, eye in enumerate(turning)]
-    targets = _morph_targets([shape.of_part(head.vertices, len(mesh.vertices)) for shape in actions])
-    meshes = [{"name": HEAD, "primitives": [_primitive(buffer, head, 0, list(targets.values()))]}]
+    targets = list(_morph_targets([shape.of_part(head.vertices) for shape in actions]))
+    meshes = [{"name": HEAD, "primitives": [_primitive(buffer, head, 0, targets)]}]
     if targets:
-        meshes[0] |= {"weights": [0.0] * len(targets), "extras": {"targetNames": list(targets)}}
+        meshes[0] |= {"weights": [0.0] * len(targets), "extras": {"targetNames": [shape.name for shape in targets]}}
     content = {
         "asset": {"version": "2.0", "generator": "Limn"},
         "scene": 0,
@@ -150,25 +150,26 @@ def write_glb(
     _write_container(Path(path), content, bytes(buffer.data))
 
 
-def _morph_targets(shapes: Sequence[BlendShape]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """{name: (vertices [n], offsets [n, 3] mm)}: the actions, then what their in-betweens add to the straight way."""
-    targets = {shape.name: (shape.vertices, shape.offsets) for shape in shapes}
+def _morph_targets(shapes: Sequence[BlendShape]) -> Iterator[BlendShape]:
+    """The shapes, each straight from 0 to 1, then what their in-betweens add to that way."""
     for shape in shapes:
-        for weight, offsets in shape.between:
-            targets[f"{shape.name}_{round(100 * weight)}"] = shape.vertices, offsets - weight * shape.offsets
-    return targets
+        yield BlendShape(shape.name, shape.vertices, shape.offsets,
+                         normals=None if shape.normals is None else shape.normals[:1])
+    for shape in shapes:
+        for k, (weight, offsets) in enumerate(shape.between, 1):
+            normals = None if shape.normals is None else shape.normals[k] - weight * shape.normals[0]
+            yield BlendShape(f"{shape.name}_{round(100 * weight)}", shape.vertices, offsets - weight * shape.offsets,
+                             normals=None if normals is None else normals[None])
 
 
-def _primitive(
-    buffer: _Buffer, part: RigidPart, material: int, targets: Sequence[tuple[np.ndarray, np.ndarray]] = ()
-) -> dict:
+def _primitive(buffer: _Buffer, part: RigidPart, material: int, targets: Sequence[BlendShape] = ()) -> dict:
     """glTF knows one index per corner: vertices are doubled along texture seams. targets: see _morph_targets; what they
     move comes first, so that two bytes are enough for its indices."""
     mesh = part.mesh
     corners, index, _ = unique_pairs(np.column_stack([mesh.faces.ravel(), mesh.face_uvs.ravel()]))
     moving = np.zeros(len(mesh.vertices), bool)
-    for moved, _ in targets:
-        moving[moved] = True
+    for target in targets:
+        moving[target.vertices] = True
     order = np.argsort(~moving[corners[:, 0]], kind="stable")
     vertex, coordinate = corners[order].T
     index = np.argsort(order)[index]
@@ -180,16 +181,20 @@ def _primitive(
     primitive = {"attributes": attributes, "indices": buffer.array(index.astype(np.uint32), _INDEX),
                  "material": material}
     if targets:
-        primitive["targets"] = [{"POSITION": _morph_target(buffer, vertex, *target)} for target in targets]
+        primitive["targets"] = [_morph_target(buffer, vertex, target) for target in targets]
     return primitive
 
 
-def _morph_target(buffer: _Buffer, vertex: np.ndarray, moving: np.ndarray, offsets: np.ndarray) -> int:
-    """Accessor for corners that are each a vertex [n] of the mesh."""
+def _morph_target(buffer: _Buffer, vertex: np.ndarray, shape: BlendShape) -> dict[str, int]:
+    """Accessors for corners that are each a vertex [n] of the mesh."""
     row = np.full(int(vertex.max()) + 1, -1)
-    row[moving] = np.arange(len(moving))
+    row[shape.vertices] = np.arange(len(shape.vertices))
     index = np.nonzero(row[vertex] >= 0)[0]
-    return buffer.sparse(len(vertex), index, offsets[row[vertex[index]]] * METRES_PER_MM)
+    moved = row[vertex[index]]
+    values = [shape.offsets[moved] * METRES_PER_MM]
+    if shape.normals is not None:
+        values.append(shape.normals[0, moved])
+    return dict(zip(("POSITION", "NORMAL"), buffer.sparse(len(vertex), index, *values), strict=False))
 
 
 def _material(buffer: _Buffer, maps: Mapping[str, np.ndarray]) -> tuple[list[int], dict]:

@@ -78,6 +78,19 @@ def read_obj(path: Path | str) -> Mesh:
     return _checked(Mesh(vertices, faces, uvs, face_uvs), path)
 
 
+def read_obj_groups(path: Path | str) -> dict[str, np.ndarray]:
+    """{name: faces [n] int, in the file's order} of the groups that write_obj wrote."""
+    groups, own, count = {}, [], 0
+    with open(path, encoding="utf-8", errors="replace") as file:
+        for line in file:
+            if line.startswith("g "):
+                own = groups.setdefault(line[2:].strip(), [])
+            elif line.startswith("f "):
+                own.append(count)
+                count += 1
+    return {name: np.array(faces, int) for name, faces in groups.items()}
+
+
 def _numbers(rows: list[list[str]], count: int) -> np.ndarray:
     """The first count fields of each row [N, count]; ValueError where there are fewer, or others than numbers."""
     fields = chain.from_iterable(row[:count] for row in rows)

@@ -5,7 +5,7 @@
 
     /<subject>          Xform, default prim, kind component, assetInfo, inherits /__class__/<subject>
       geo               SkelRoot where the head has facial actions (usd_actions)
-      geo/head          Mesh in millimetres, faceVarying UVs and normals
+      geo/head          Mesh in millimetres, UVs per face corner, normals per vertex
       geo/eye_right     Mesh about the eyeball's centre, which it turns about; geo/eye_left likewise
       mtl/skin          Material: UsdPreviewSurface and OpenPBR; mtl/eye likewise
       capture           camera, lights and the clip's card, in the variant "clip" of the variant set "capture"
@@ -91,8 +91,9 @@ class HeadAsset:
     maps: {name of usd_material.SHADER_INPUTS: texture}; envmap: the dome light's texture; lamp: what stands near of the
     light and is not in that texture, or None; plate: the clip's frames, or None; eyes: the right and the left eyeball
     of the mesh, to be meshes of their own, or none; actions: blend shapes of the mesh, which move no eyeball; details:
-    {variant: the mesh with fewer faces}; base: the mesh as displaced quads, or None; metadata: nested dictionaries of
-    strings, numbers and lists for the root prim's customData["limn"].
+    {level: the mesh with fewer faces}; base: the mesh as displaced quads, or None; levels: of detail to be written, the
+    first one chosen: FULL, names of details, BASE; metadata: nested dictionaries of strings, numbers and lists for the
+    root prim's customData["limn"].
     """
 
     name: str
@@ -106,13 +107,17 @@ class HeadAsset:
     actions: Sequence[BlendShape] = ()
     details: Mapping[str, ReducedMesh] = field(default_factory=dict)
     base: BaseHead | None = None
+    levels: Sequence[str] = (FULL,)
     version: str = "1"
     metadata: Mapping[str, object] = field(default_factory=dict)
 
-    @property
-    def variants(self) -> tuple[str, ...]:
-        """Of the set `detail`, but for the full one."""
-        return (*self.details, *([BASE] if self.base else []))
+    def parts(self, level: str) -> tuple[RigidPart, ...]:
+        """Head and eyes at FULL or one of the details: with the full mesh's normals at all of them, since few faces
+        have worse ones, and the normal map bends those."""
+        if level == FULL:
+            return head_parts(self.mesh, self.eyes)
+        few = self.details[level]
+        return head_parts(few.mesh, [few.eyeball(eye) for eye in self.eyes], shading_normals(self.mesh))
 
 
 def prim_name(name: str) -> str:
@@ -187,23 +192,21 @@ def _define_geometry(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None
     kind = UsdSkel.Root if asset.actions else UsdGeom.Xform if asset.eyes else UsdGeom.Scope
     kind.Define(stage, geo)
     skeleton = define_skeleton(stage, geo, asset.actions) if asset.actions else None
-    full = head_parts(asset.mesh, asset.eyes)
-    for part in full:
-        prim = UsdGeom.Mesh.Define(stage, geo.AppendChild(part.name))
-        if part.name in EYES:
-            prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*map(float, part.pivot)))
-            # The variants give its value: one that stood here would be stronger than theirs in a single layer.
-            prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
-    for detail in each_detail(stage.GetPrimAtPath(root), asset.variants):
-        for part in _reduced_parts(asset, detail) if detail in asset.details else full:
+    UsdGeom.Mesh.Define(stage, geo.AppendChild(HEAD))
+    for name, eye in zip(EYES if asset.eyes else (), asset.eyes, strict=True):
+        prim = UsdGeom.Mesh.Define(stage, geo.AppendChild(name))
+        prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*map(float, eye.centre)))
+        # The variants give its value: one that stood here would be stronger than theirs in a single layer.
+        prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
+    for level in each_detail(stage.GetPrimAtPath(root), asset.levels):
+        for part in asset.parts(FULL if level == BASE else level):
             path = geo.AppendChild(part.name)
-            if detail == BASE and part.name == HEAD:
+            if level == BASE and part.name == HEAD:
                 _define_base(stage, path, asset, skeleton)
                 continue
             prim = define_mesh(stage, str(path), part.mesh, part.normals)
             if part.name == HEAD and skeleton:
-                count = len(asset.mesh.vertices)
-                bind_actions(prim, skeleton, [shape.of_part(part.vertices, count) for shape in asset.actions])
+                bind_actions(prim, skeleton, [shape.of_part(part.vertices) for shape in asset.actions])
 
 
 def _define_base(stage: Usd.Stage, path: Sdf.Path, asset: HeadAsset, skeleton: Sdf.Path | None) -> None:
@@ -213,14 +216,7 @@ def _define_base(stage: Usd.Stage, path: Sdf.Path, asset: HeadAsset, skeleton: S
     head, used = quad_part(displaced.cage, displaced.quads_beside(apart))
     prim = define_cage(stage, str(path), head)
     if skeleton:
-        count = len(displaced.cage.vertices)
-        bind_actions(prim, skeleton, [displaced.fit.shape(shape).of_part(used, count) for shape in asset.actions])
-
-
-def _reduced_parts(asset: HeadAsset, detail: str) -> tuple[RigidPart, ...]:
-    """With the normals of the full mesh: few faces have worse ones, and the normal map bends those."""
-    few = asset.details[detail]
-    return head_parts(few.mesh, [few.eyeball(eye) for eye in asset.eyes], shading_normals(asset.mesh))
+        bind_actions(prim, skeleton, [displaced.fit.shape(shape).of_part(used) for shape in asset.actions])
 
 
 def _define_materials(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None:
@@ -228,8 +224,8 @@ def _define_materials(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> Non
     UsdGeom.Scope.Define(stage, root.AppendChild("mtl"))
     material = define_material(stage, str(root.AppendPath("mtl/skin")), asset.maps)
     _bind(stage, root, HEAD, material)
-    if asset.base:
-        with in_variant(stage.GetPrimAtPath(root), DETAIL_SET, BASE, FULL):
+    if BASE in asset.levels:
+        with in_variant(stage.GetPrimAtPath(root), DETAIL_SET, BASE, asset.levels[0]):
             define_displacement(stage, material, asset.base.heights)
     with in_variant(stage.GetPrimAtPath(root), LOOK_SET, SKIN_LOOK, MEASURED):
         define_scattering(stage, material)
@@ -260,7 +256,7 @@ def _define_interface(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> Non
         "Variant set 'look': 'measured', or 'skin', into which light goes."
     )
     prim = stage.GetPrimAtPath(root)
-    define_details(prim, asset.variants)
+    define_details(prim, asset.levels)
     define_variants(prim, LOOK_SET, (MEASURED, SKIN_LOOK), MEASURED)
     model = Usd.ModelAPI(prim)
     model.SetKind(Kind.Tokens.component)
@@ -329,13 +325,12 @@ def _camera_metadata(capture: UsdCapture) -> dict:
 
 
 def define_mesh(stage: Usd.Stage, path: str, mesh: Mesh, normals: np.ndarray) -> UsdGeom.Mesh:
-    """A polygon mesh (subdivisionScheme none) with indexed faceVarying UVs and normals [V, 3], and its extent."""
+    """A polygon mesh (subdivisionScheme none) with indexed faceVarying UVs, normals [V, 3] per vertex, which blend
+    shapes can turn, and its extent."""
     prim = _define_polygons(stage, path, mesh.vertices, mesh.faces, mesh.uvs, mesh.face_uvs)
     prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    varying = UsdGeom.Tokens.faceVarying
-    corners = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("normals", Sdf.ValueTypeNames.Normal3fArray, varying)
-    corners.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, np.float32)))
-    corners.SetIndices(prim.GetFaceVertexIndicesAttr().Get())
+    prim.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, np.float32)))
+    prim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     return prim
 
 

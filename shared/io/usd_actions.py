@@ -2,7 +2,7 @@
 
     geo                 SkelRoot: below it UsdSkel deforms meshes
       head              Mesh with SkelBindingAPI, the names of its actions and where they are
-        <action>        BlendShape: offsets of the points that move, in-betweens
+        <action>        BlendShape: offsets of the points that move and of their normals, in-betweens
       skeleton          Skeleton, as UsdSkel wants one; its only joint, the head itself, moves nothing
         actions         SkelAnimation with the weight of each action, all 0: the head at rest
 
@@ -54,10 +54,14 @@ def _define_shape(stage: Usd.Stage, path: Sdf.Path, shape: BlendShape) -> Sdf.Pa
     prim = UsdSkel.BlendShape.Define(stage, path)
     prim.CreatePointIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(shape.vertices, np.int32)))
     prim.CreateOffsetsAttr(_vectors(shape.offsets))
-    for weight, offsets in shape.between:
+    if shape.normals is not None:
+        prim.CreateNormalOffsetsAttr(_vectors(shape.normals[0]))
+    for k, (weight, offsets) in enumerate(shape.between):
         between = prim.CreateInbetween(HALF_NAME if weight == HALF_WEIGHT else f"at_{round(100 * weight)}")
         between.SetWeight(weight)
         between.SetOffsets(_vectors(offsets))
+        if shape.normals is not None:
+            between.SetNormalOffsets(_vectors(shape.normals[1 + k]))
     return path
 
 

@@ -17,7 +17,7 @@ payload, so that they can be chosen before it is loaded).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 
 from pxr import Usd
 
@@ -28,21 +28,19 @@ REDUCED_FACES = {"20k": 20_000, "5k": 5_000}
 """Variant -> how many faces head and eyes have together."""
 
 
-def define_details(root: Usd.Prim, names: Iterable[str]) -> None:
-    """The variants, of which the full one is chosen; none without names of reduced ones."""
-    names = tuple(names)
-    if names:
-        define_variants(root, DETAIL_SET, (FULL, *names), FULL)
+def define_details(root: Usd.Prim, levels: Sequence[str]) -> None:
+    """Variants of these names, of which the first is chosen; none where there is one alone."""
+    if len(levels) > 1:
+        define_variants(root, DETAIL_SET, levels, levels[0])
 
 
-def each_detail(root: Usd.Prim, names: Iterable[str]) -> Iterator[str]:
-    """FULL and each of the names, while what is written to the stage goes into the variant of that name; FULL alone,
-    and no variant, without names."""
-    names = tuple(names)
-    define_details(root, names)
-    if not names:
-        yield FULL
+def each_detail(root: Usd.Prim, levels: Sequence[str]) -> Iterator[str]:
+    """Each of the levels, while what is written to the stage goes into the variant of that name; one alone goes into no
+    variant."""
+    define_details(root, levels)
+    if len(levels) == 1:
+        yield levels[0]
         return
-    for name in (*names, FULL):
-        with in_variant(root, DETAIL_SET, name, FULL):
+    for name in (*levels[1:], levels[0]):
+        with in_variant(root, DETAIL_SET, name, levels[0]):
             yield name

@@ -119,32 +119,38 @@ def _mesh_errors(prim: UsdGeom.Mesh) -> list[str]:
     indices = np.array(prim.GetFaceVertexIndicesAttr().Get())
     points = np.array(prim.GetPointsAttr().Get())
     primvars = UsdGeom.PrimvarsAPI(prim)
-    coordinates, normals = primvars.GetPrimvar("st"), primvars.GetPrimvar("normals")
+    coordinates, normals = primvars.GetPrimvar("st"), prim.GetNormalsAttr()
     smooth = prim.GetSubdivisionSchemeAttr().Get() == UsdGeom.Tokens.catmullClark
     sides = 4 if smooth else 3
     if set(counts) != {sides} or len(indices) != sides * len(counts):
         return [f"{path}: faces are not all {'quads' if smooth else 'triangles'}"]
     errors = []
-    if smooth and normals:
+    if smooth and normals.HasAuthoredValue():
         errors.append(f"{path}: normals of its own on a surface that subdivision makes")
-    for primvar in (coordinates,) if smooth else (coordinates, normals):
-        if primvar.GetInterpolation() != UsdGeom.Tokens.faceVarying or len(primvar.GetIndices()) != len(
-            indices
-        ):
-            errors.append(f"{primvar.GetAttr().GetPath()}: not one value per face corner")
+    if primvars.GetPrimvar("normals"):
+        errors.append(f"{path}: normals as a primvar, which no blend shape turns")
+    if coordinates.GetInterpolation() != UsdGeom.Tokens.faceVarying or len(coordinates.GetIndices()) != len(indices):
+        errors.append(f"{coordinates.GetAttr().GetPath()}: not one value per face corner")
     faces, face_uvs = (np.array(each).reshape(-1, sides) for each in (indices, coordinates.GetIndices()))
     if smooth:
         faces, face_uvs = triangulated(faces), triangulated(face_uvs)
     mesh = Mesh(points, faces, np.array(coordinates.Get()), face_uvs)
     errors += [f"{path}: {error}" for error in mesh_errors(mesh)]
     if not smooth:
-        lengths = np.linalg.norm(np.array(normals.Get()), axis=1)
-        if np.abs(lengths[np.unique(indices.clip(0, len(lengths) - 1))] - 1.0).max() > 1e-3:
-            errors.append(f"{path}: normals are not unit vectors")
+        errors += _normal_errors(prim, len(points))
     extent = np.array(prim.GetExtentAttr().Get())
     if not np.allclose(extent, [points.min(0), points.max(0)], atol=1e-3):
         errors.append(f"{path}: extent does not enclose the points")
     return errors
+
+
+def _normal_errors(prim: UsdGeom.Mesh, count: int) -> list[str]:
+    normals = np.array(prim.GetNormalsAttr().Get() or ()).reshape(-1, 3)
+    if prim.GetNormalsInterpolation() != UsdGeom.Tokens.vertex or len(normals) != count:
+        return [f"{prim.GetPath()}: {len(normals)} normals of {count} points, expected one for each"]
+    if np.abs(np.linalg.norm(normals, axis=1) - 1.0).max() > 1e-3:
+        return [f"{prim.GetPath()}: normals are not unit vectors"]
+    return []
 
 
 def _path_errors(prim: Usd.Prim) -> list[str]:

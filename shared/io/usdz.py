@@ -14,7 +14,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,11 +34,11 @@ _LOCAL_HEADER = 30
 _PADDING_ID = 0x1986
 
 
-def write_head_usdz(path: Path | str, asset: HeadAsset, maps: Mapping[str, np.ndarray], envmap: np.ndarray) -> None:
-    """Packs the asset, its maps {name of export_maps.MAPS: [S, S] or [S, S, 3]} and envmap [H, W, 3], linear Rec.709.
-
-    The asset's own file names, the clip's pictures and the displaced base are left aside: viewers do not displace.
-    """
+def write_head_usdz(
+    path: Path | str, asset: HeadAsset, levels: Sequence[str], maps: Mapping[str, np.ndarray], envmap: np.ndarray
+) -> None:
+    """Packs the asset at these levels of detail, its maps {name of export_maps.MAPS: [S, S] or [S, S, 3]} and envmap
+    [H, W, 3], linear Rec.709. The asset's own file names, its levels and the clip's pictures are left aside."""
     with tempfile.TemporaryDirectory() as scratch:
         folder, textures = Path(scratch), {}
         (folder / "maps").mkdir()
@@ -53,7 +53,7 @@ def write_head_usdz(path: Path | str, asset: HeadAsset, maps: Mapping[str, np.nd
         light = TextureFile("./envmap.exr", WORKING_SPACE)
         write_exr(folder / light.path, envmap, colour_space=WORKING_SPACE, half=True, latlong=True)
         layer = folder / "head.usdc"
-        write_single_layer(layer, replace(asset, maps=textures, envmap=light, plate=None, base=None))
+        write_single_layer(layer, replace(asset, maps=textures, envmap=light, plate=None, levels=levels))
         package = folder / "head.usdz"
         write_usdz(package, layer)
         shutil.move(package, path)

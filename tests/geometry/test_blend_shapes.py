@@ -1,8 +1,10 @@
 """Blend shapes: sparse, with in-betweens, of a mesh or a part of it."""
 
 import numpy as np
+from toy_result import toy_mesh
 
-from shared.geometry.blend_shapes import BlendShape
+from shared.geometry.blend_shapes import BlendShape, with_normals
+from shared.geometry.mesh import Mesh, shading_normals
 
 MOVES = np.array([[0.0, 0, 0], [4.0, 0, 0], [0.0, 2, 0], [0.004, 0, 0], [0.0, 0, 1]])
 HALF = np.array([[0.0, 0, 0], [1.0, 1, 0], [0.0, 1, 0], [0.0, 0, 0], [0.0, 0, 1]])
@@ -44,10 +46,27 @@ def test_applied_moves_the_rest_nowhere():
 
 
 def test_a_part_has_its_own_numbers():
-    part = SHAPE.of_part(np.array([0, 2, 3, 4]), 5)
+    part = SHAPE.of_part(np.array([0, 2, 3, 4]))
     np.testing.assert_array_equal(part.vertices, [1, 3])
     np.testing.assert_array_equal(part.offsets, MOVES[[2, 4]])
     np.testing.assert_array_equal(part.between[0][1], HALF[[2, 4]])
-    shuffled = SHAPE.of_part(np.array([4, 1]), 5)
+    shuffled = SHAPE.of_part(np.array([4, 1]))
     np.testing.assert_array_equal(shuffled.vertices, [0, 1])
     np.testing.assert_array_equal(shuffled.offsets, MOVES[[4, 1]])
+
+
+def test_normals_added_are_those_of_the_moved_mesh():
+    """Of the whole of it and of the in-between, in the part's own numbers; where all faces shrink to nothing, none."""
+    mesh = toy_mesh()
+    moves = np.zeros_like(mesh.vertices)
+    moves[40:120] = np.random.default_rng(2).normal(0.0, 3.0, (80, 3))
+    (shape,) = with_normals([BlendShape.of("smile", moves, 0.0, ((0.5, 0.7 * moves),))], mesh)
+    rest = shading_normals(mesh)
+    for found, moved in zip(shape.normals, (moves, 0.7 * moves), strict=True):
+        after = shading_normals(mesh.replace(vertices=mesh.vertices + moved))
+        np.testing.assert_allclose(rest[shape.vertices] + found, after[shape.vertices], atol=1e-6)
+    part = shape.of_part(np.array([3, 77, 60]))
+    np.testing.assert_array_equal(part.normals, shape.normals[:, [37, 20]])
+    flat = Mesh(np.eye(3), np.array([[0, 1, 2]]), np.eye(3)[:, :2], np.array([[0, 1, 2]]))
+    (squeezed,) = with_normals([BlendShape.of("blink", -flat.vertices, 0.0)], flat)
+    assert not squeezed.normals.any()

@@ -22,9 +22,10 @@ from toy_result import (
     toy_poses,
 )
 
-from shared.geometry.blend_shapes import BlendShape
+from shared.geometry.blend_shapes import BlendShape, with_normals
 from shared.geometry.eyeballs import eyeballs_of, gaze_rotation
 from shared.geometry.mesh import vertex_normals
+from shared.geometry.parts import head_parts
 from shared.imaging.color import encode_srgb
 from shared.io.gltf import write_glb
 from shared.io.usd_capture import UsdCapture, world_from_head_rigid, world_from_usd_camera
@@ -43,7 +44,7 @@ def moves(request):
 
 @pytest.fixture
 def file(tmp_path, moves):
-    write_glb(tmp_path / "head.glb", NAME, toy_mesh(), toy_maps(), capture(moves))
+    write_glb(tmp_path / "head.glb", NAME, head_parts(toy_mesh()), toy_maps(), capture(moves))
     return tmp_path / "head.glb"
 
 
@@ -160,8 +161,8 @@ def eye_rotations(content, binary, node):
 @pytest.fixture
 def eyed(tmp_path, moves):
     surface = toy_eyed_surface()
-    write_glb(tmp_path / "eyes.glb", NAME, surface.mesh, toy_maps(), replace(capture(moves), eye_turn=toy_gaze()),
-              eyeballs_of(surface))
+    write_glb(tmp_path / "eyes.glb", NAME, head_parts(surface.mesh, eyeballs_of(surface)), toy_maps(),
+              replace(capture(moves), eye_turn=toy_gaze()))
     return tmp_path / "eyes.glb"
 
 
@@ -204,7 +205,7 @@ def test_eyes_have_a_material_of_their_own(eyed):
 
 def test_eyes_without_a_gaze_stay_at_rest(tmp_path):
     surface = toy_eyed_surface()
-    write_glb(tmp_path / "a.glb", NAME, surface.mesh, toy_maps(), capture("head"), eyeballs_of(surface))
+    write_glb(tmp_path / "a.glb", NAME, head_parts(surface.mesh, eyeballs_of(surface)), toy_maps(), capture("head"))
     assert {row["target"]["node"] for row in chunks(tmp_path / "a.glb")[0]["animations"][0]["channels"]} == {0}
 
 
@@ -239,9 +240,9 @@ def test_actions_are_named_morph_targets(tmp_path, eyes):
     """Corner by corner the offsets of the shapes, those of the in-between what it adds to the straight way."""
     surface = toy_eyed_surface()
     mesh, balls = (surface.mesh, eyeballs_of(surface)) if eyes else (toy_mesh(), ())
-    actions = toy_actions(len(mesh.vertices))
-    write_glb(tmp_path / "a.glb", NAME, mesh, toy_maps(), capture("head"), balls, actions)
-    write_glb(tmp_path / "b.glb", NAME, mesh, toy_maps(), capture("head"), balls)
+    actions, parts = with_normals(toy_actions(len(mesh.vertices)), mesh), head_parts(mesh, balls)
+    write_glb(tmp_path / "a.glb", NAME, parts, toy_maps(), capture("head"), actions)
+    write_glb(tmp_path / "b.glb", NAME, parts, toy_maps(), capture("head"))
     (content, binary), (plain, _) = chunks(tmp_path / "a.glb"), chunks(tmp_path / "b.glb")
     head = content["meshes"][0]
     assert head["extras"]["targetNames"] == ["jawOpen", "eyeBlinkLeft", "eyeBlinkLeft_50"]
@@ -249,18 +250,21 @@ def test_actions_are_named_morph_targets(tmp_path, eyes):
     (primitive,) = head["primitives"]
     places = accessor(content, binary, primitive["attributes"]["POSITION"])
     jaw, blink = actions
-    half = BlendShape("", blink.vertices, blink.between[0][1] - 0.5 * blink.offsets)
+    half = BlendShape("", blink.vertices, blink.between[0][1] - 0.5 * blink.offsets,
+                      normals=blink.normals[1:] - 0.5 * blink.normals[:1])
     rest = mesh.vertices * 0.001
     own = {tuple(place): k for k, place in enumerate(rest.astype(np.float32))}
     vertex = [own[tuple(place)] for place in places]
     for shape, target in zip((jaw, blink, half), primitive["targets"], strict=True):
         expected = shape.applied(np.zeros_like(rest), 1.0)[vertex] * 0.001
         np.testing.assert_allclose(dense(content, binary, target["POSITION"]), expected, atol=1e-8)
+        turned = replace(shape, offsets=shape.normals[0]).applied(np.zeros_like(rest), 1.0)[vertex]
+        np.testing.assert_allclose(dense(content, binary, target["NORMAL"]), turned, atol=1e-6)
     assert "targets" not in plain["meshes"][0]["primitives"][0] and set(plain["meshes"][0]) == {"name", "primitives"}
     assert all("targets" not in each["primitives"][0] for each in content["meshes"][1:])
 
 
 def test_names_and_bytes(file, tmp_path, moves):
     assert chunks(file)[0]["scenes"][0]["name"] == NAME
-    write_glb(tmp_path / "again.glb", NAME, toy_mesh(), toy_maps(), capture(moves))
+    write_glb(tmp_path / "again.glb", NAME, head_parts(toy_mesh()), toy_maps(), capture(moves))
     assert (tmp_path / "again.glb").read_bytes() == file.read_bytes()

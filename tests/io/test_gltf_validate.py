@@ -8,6 +8,7 @@ import pytest
 from toy_result import FRAMES, INTRINSICS, SOURCE_SIZE, toy_eyed_surface, toy_gaze, toy_maps, toy_poses
 
 from shared.geometry.eyeballs import eyeballs_of
+from shared.geometry.parts import head_parts
 from shared.io.gltf import write_glb
 from shared.io.gltf_validate import glb_errors
 from shared.io.usd_capture import UsdCapture
@@ -97,7 +98,7 @@ def original(tmp_path_factory):
     """A head with turning eyes, as it is exported."""
     surface, path = toy_eyed_surface(), tmp_path_factory.mktemp("glb") / "head.glb"
     capture = UsdCapture(toy_poses(), FRAMES, 25.0, INTRINSICS, *SOURCE_SIZE, "head", eye_turn=toy_gaze())
-    write_glb(path, "toy", surface.mesh, toy_maps(), capture, eyeballs_of(surface))
+    write_glb(path, "toy", head_parts(surface.mesh, eyeballs_of(surface)), toy_maps(), capture)
     return path
 
 

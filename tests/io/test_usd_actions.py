@@ -7,8 +7,9 @@ import pytest
 from pxr import Usd, UsdGeom, UsdSkel, Vt
 from toy_result import FRAMES, INTRINSICS, SOURCE_SIZE, toy_eyed_surface, toy_gaze, toy_mesh, toy_poses
 
-from shared.geometry.blend_shapes import BlendShape
+from shared.geometry.blend_shapes import BlendShape, with_normals
 from shared.geometry.eyeballs import eyeballs_of
+from shared.geometry.mesh import vertex_normals
 from shared.geometry.parts import head_parts
 from shared.io.usd import HeadAsset, write_head_usda, write_single_layer
 from shared.io.usd_capture import UsdCapture, world_from_head_rigid
@@ -33,7 +34,8 @@ def asset(eyes: bool) -> HeadAsset:
     capture = UsdCapture(toy_poses(), FRAMES, 25.0, INTRINSICS, *SOURCE_SIZE, "head",
                          eye_turn=toy_gaze() if eyes else None)
     return HeadAsset("toy", mesh, MAPS, TextureFile("./envmap.exr"), capture,
-                     eyes=eyeballs_of(surface) if eyes else (), actions=shapes(len(mesh.vertices)))
+                     eyes=eyeballs_of(surface) if eyes else (),
+                     actions=with_normals(shapes(len(mesh.vertices)), mesh))
 
 
 @pytest.fixture(params=[True, False], ids=["eyes", "one mesh"])
@@ -53,7 +55,7 @@ def head_of(stage):
 def head_actions(own):
     """The shapes in the numbers that the head's vertices have in its own mesh."""
     head = head_parts(own.mesh, own.eyes)[0]
-    return [shape.of_part(head.vertices, len(own.mesh.vertices)) for shape in own.actions]
+    return [shape.of_part(head.vertices) for shape in own.actions]
 
 
 def baked(stage, **weights):
@@ -77,11 +79,13 @@ def test_names_and_offsets(opened):
         assert path.name == shape.name
         np.testing.assert_array_equal(prim.GetPointIndicesAttr().Get(), shape.vertices)
         np.testing.assert_array_equal(prim.GetOffsetsAttr().Get(), shape.offsets)
-        found = [(between.GetWeight(), np.array(between.GetOffsets())) for between in prim.GetInbetweens()]
+        np.testing.assert_array_equal(prim.GetNormalOffsetsAttr().Get(), shape.normals[0])
+        found = prim.GetInbetweens()
         assert len(found) == len(shape.between)
-        for (weight, offsets), (expected_weight, expected) in zip(found, shape.between, strict=True):
-            assert weight == expected_weight
-            np.testing.assert_array_equal(offsets, expected)
+        for between, (weight, offsets), normals in zip(found, shape.between, shape.normals[1:], strict=True):
+            assert between.GetWeight() == weight
+            np.testing.assert_array_equal(between.GetOffsets(), offsets)
+            np.testing.assert_array_equal(between.GetNormalOffsets(), normals)
 
 
 def test_the_head_at_rest_is_the_one_without_actions(opened, tmp_path):
@@ -104,6 +108,16 @@ def test_usd_plays_what_the_shape_says(opened, weight):
     found = baked(stage, eyeBlinkLeft=weight, jawOpen=0.3)
     jaw, blink = head_actions(own)
     np.testing.assert_allclose(found, blink.applied(jaw.applied(rest, 0.3), weight), atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["jawOpen", "eyeBlinkLeft"])
+def test_usd_turns_normals_to_those_of_the_moved_head(opened, name):
+    own, stage = opened
+    baked(stage, **{name: 1.0})
+    found = np.array(head_of(stage).GetNormalsAttr().Get(Usd.TimeCode.EarliestTime()))
+    head, shape = head_parts(own.mesh, own.eyes)[0], next(each for each in head_actions(own) if each.name == name)
+    expected = vertex_normals(shape.applied(head.mesh.vertices, 1.0), head.mesh.faces)
+    np.testing.assert_allclose(found[shape.vertices], expected[shape.vertices], atol=1e-5)
 
 
 def test_head_and_eyes_move_together(opened):

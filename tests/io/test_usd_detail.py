@@ -7,7 +7,7 @@ import pytest
 from pxr import Usd, UsdGeom, UsdShade, UsdSkel, Vt
 from toy_result import FRAMES, INTRINSICS, SOURCE_SIZE, toy_eyed_surface, toy_gaze, toy_poses
 
-from shared.geometry.blend_shapes import BlendShape
+from shared.geometry.blend_shapes import BlendShape, with_normals
 from shared.geometry.eyeballs import eyeballs_of
 from shared.geometry.mesh import shading_normals
 from shared.geometry.reduction import reduced
@@ -36,7 +36,8 @@ def asset(eyes: bool) -> HeadAsset:
                          eye_turn=toy_gaze() if eyes else None)
     details = dict(zip(FACES, reduced(SURFACE, tuple(FACES.values())), strict=True))
     return HeadAsset("toy", SURFACE.mesh, MAPS, TextureFile("./envmap.exr"), capture, details=details,
-                     eyes=eyeballs_of(SURFACE) if eyes else (), actions=actions(len(SURFACE.mesh.vertices)))
+                     eyes=eyeballs_of(SURFACE) if eyes else (), levels=(FULL, *details),
+                     actions=with_normals(actions(len(SURFACE.mesh.vertices)), SURFACE.mesh))
 
 
 @pytest.fixture(scope="module", params=[(True, "layers"), (True, "one"), (False, "layers")],
@@ -88,7 +89,7 @@ def test_they_can_be_chosen_before_anything_is_loaded(written):
 
 def test_the_full_head_is_the_one_without_variants(written, tmp_path):
     own, path = written
-    write_single_layer(tmp_path / "plain.usda", replace(own, details={}))
+    write_single_layer(tmp_path / "plain.usda", replace(own, details={}, levels=(FULL,)))
     plain = opened(tmp_path / "plain.usda")
     assert DETAIL_SET not in plain.GetDefaultPrim().GetVariantSets().GetNames()
     for detail in (None, FULL):
@@ -110,7 +111,7 @@ def test_reduced_meshes_have_the_full_ones_normals_and_no_vertex_too_many(writte
         translate = mesh.GetTranslateOp() if mesh.GetOrderedXformOps() else None
         pivot = np.array(translate.Get()) if translate and translate.Get() is not None else np.zeros(3)
         points, faces = (np.array(each.Get()) for each in (mesh.GetPointsAttr(), mesh.GetFaceVertexIndicesAttr()))
-        normals = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals").Get())
+        normals = np.array(mesh.GetNormalsAttr().Get())
         assert set(faces) == set(range(len(points)))
         for point, normal in zip(points + pivot, normals, strict=True):
             nearest = min(corners, key=lambda corner: np.square(np.array(corner) - point).sum())
@@ -169,5 +170,5 @@ def test_every_variant_is_sound_and_one_that_is_not_is_named(written, tmp_path):
 
 def test_a_surface_without_segments_has_levels_too(tmp_path):
     details = {"some": reduced(Surface(SURFACE.mesh), [500])[0]}
-    write_single_layer(tmp_path / "head.usda", replace(asset(False), details=details))
+    write_single_layer(tmp_path / "head.usda", replace(asset(False), details=details, levels=(FULL, "some")))
     assert 498 < face_count(opened(tmp_path / "head.usda", "some")) <= 500

@@ -1,20 +1,25 @@
 """`limn turntable`: what it writes, what it keeps, what it leaves alone."""
 
 import shutil
+from dataclasses import replace
 
 import av
 import numpy as np
 import pytest
 from toy_export import write_toy_export
+from toy_result import EYE_CENTRES, FRAMES
 
 from shared.imaging.material_labels import CLOTH, LABELS
 from shared.io.arrays import read_json
 from shared.io.images import read_png
 from shared.io.material_maps import LABEL_COLOURS
+from shared.rendering.views import orbit_camera
 from tools.limn import main
 from tools.relight import turntable
+from tools.relight.inputs import open_asset
 from tools.relight.map_sheet import LABEL_PX, TILE_PX, map_sheet
-from tools.relight.turntable import HEAD, LIGHT, RECORD, SHEET, TurntableSettings, write_turntable
+from tools.relight.options import CLAY
+from tools.relight.turntable import HEAD, LIGHT, RECORD, SHEET, TurntableSettings, looking, write_turntable
 
 SMALL = ("--size", "64", "--frames", "3")
 
@@ -66,6 +71,26 @@ def test_lights_stand_still_while_the_head_turns_and_turn_while_it_does_not(orig
         assert left > 1.2 * right
     turned = [sides(frame) for frame in frames_of(original / "turntable" / LIGHT)]
     assert turned[0][1] > 1.2 * turned[0][0] and any(left > right for left, right in turned[1:])
+
+
+def test_eyes_look_as_they_did_in_the_clip_from_there(original):
+    """The toy's gaze by the side from which the clip saw the head; behind the outermost poses theirs; without a gaze as
+    the camera was."""
+    asset = open_asset(original / "export", **CLAY)
+    assert asset.eyes is not None and asset.eye_turn.shape == (len(FRAMES), 2, 2)
+    np.testing.assert_allclose([ball.centre for ball in asset.eyes.balls], EYE_CENTRES, atol=1e-3)
+    gaze = np.repeat(np.linspace(-0.2, 0.2, len(asset.poses))[:, None, None], 2, axis=1) * [1.0, 0.5]
+    gaze[2, 0] = np.nan
+    sides = np.radians(30.0) * np.linspace(-1.0, 1.0, len(asset.poses))
+    poses = np.array([orbit_camera(asset.mesh, np.degrees(side), 0.0, 64).camera_from_head for side in sides])
+    asset = replace(asset, poses=poses, eye_turn=gaze)
+    front = orbit_camera(asset.mesh, 0.0, 0.0, 64)
+    for side in (0, 2, 4):
+        found = looking(asset, replace(front, camera_from_head=poses[side])).gaze
+        np.testing.assert_allclose(found[1], gaze[side, 1], atol=0.02)
+    behind = looking(asset, orbit_camera(asset.mesh, 150.0, 0.0, 64)).gaze
+    np.testing.assert_allclose(behind, gaze[-1], atol=0.02)
+    assert looking(replace(asset, eye_turn=None), front) is front
 
 
 def test_what_is_there_is_kept_and_what_is_not_is_made(base, capsys):

@@ -11,7 +11,7 @@ from shared.geometry.eyeballs import eyeballs_of, gaze_rotation
 from shared.geometry.mesh import vertex_normals
 from shared.geometry.transforms import rigid
 from shared.io.arrays import load_arrays, save_arrays
-from shared.io.meshes import read_obj
+from shared.io.meshes import read_obj, read_obj_groups
 from shared.io.usd import VARIANT_SET, VARIANT_STILL
 from stages import export_usd
 
@@ -47,9 +47,8 @@ def corners(root, name, time):
     """[3 m, 3] places of a part's corners in the asset's world, with their UVs and normals."""
     prim, transform = UsdGeom.Mesh(root.GetPrimAtPath(f"geo/{name}")), placed(root, name, time)
     points = np.array(prim.GetPointsAttr().Get(), np.float64) @ transform[:3, :3].T + transform[:3, 3]
-    primvars = UsdGeom.PrimvarsAPI(prim)
-    uvs, normals = (np.array(primvars.GetPrimvar(what).ComputeFlattened()) for what in ("st", "normals"))
-    return points[np.array(prim.GetFaceVertexIndicesAttr().Get())], uvs, normals
+    uvs, faces = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st"), np.array(prim.GetFaceVertexIndicesAttr().Get())
+    return points[faces], np.array(uvs.ComputeFlattened()), np.array(prim.GetNormalsAttr().Get())[faces]
 
 
 def test_parts_at_the_default_pose_are_the_mesh(opened):
@@ -117,21 +116,15 @@ def test_eyes_have_a_material_of_their_own(opened):
 
 def test_obj_and_poses_hold_the_eyes(exported):
     surface, folder = toy_eyed_surface(), exported[1]
-    lines = (folder / "mesh.obj").read_text().splitlines()
-    faces = {}
-    for line in lines:
-        if line.startswith("g "):
-            name = line[2:]
-        elif line.startswith("f "):
-            faces.setdefault(name, []).append(line)
-    assert {name: len(rows) for name, rows in faces.items()} == {"head": 512, "eye_left": 128, "eye_right": 128}
-    back = read_obj(folder / "mesh.obj")
+    back, groups = read_obj(folder / "mesh.obj"), read_obj_groups(folder / "mesh.obj")
+    assert {name: len(faces) for name, faces in groups.items()} == {"head": 512, "eye_left": 128, "eye_right": 128}
     np.testing.assert_array_equal(back.faces, surface.mesh.faces)
     np.testing.assert_allclose(back.vertices, surface.mesh.vertices, atol=1e-4)
-    right = np.array([int(corner.split("/")[0]) - 1 for line in faces["eye_right"] for corner in line.split()[1:]])
-    assert back.vertices[right, 0].max() < 0
+    for name, ball in zip(("eye_right", "eye_left"), eyeballs_of(surface), strict=True):
+        np.testing.assert_array_equal(groups[name], np.sort(ball.faces))
     poses = load_arrays(folder / "poses.npz")
     np.testing.assert_array_equal(poses["gaze"], toy_gaze())
+    np.testing.assert_array_equal(poses["eye_turn"], toy_gaze())
     assert field_faults(poses, EXPORTED_POSES) == []
 
 

@@ -83,10 +83,9 @@ def _clip_shot(asset: Asset, frame: int, options: argparse.Namespace) -> Relight
     scale = options.size / (2.0 * asset.intrinsics[1, 2])
     width = 2 * round(asset.intrinsics[0, 2] * scale)
     lens = np.diag([scale, scale, 1.0]) @ asset.intrinsics
-    return RelightShot(
-        f"frame{frame:06d}", ViewCamera(asset.poses[found[0]], lens, (width, options.size)), options.light_yaw,
-        asset.moves
-    )
+    gaze = None if asset.eye_turn is None else asset.eye_turn[found[0]]
+    camera = ViewCamera(asset.poses[found[0]], lens, (width, options.size), gaze)
+    return RelightShot(f"frame{frame:06d}", camera, options.light_yaw, asset.moves)
 
 
 def render_shots(
@@ -173,6 +172,7 @@ def run(options: argparse.Namespace) -> list[Path]:
         [shot.camera for shot in shots],
         light_resolution=max(8, round((options.directions / 6) ** 0.5)),
         deep=deep,
+        eyes=asset.eyes,
     )
     try:
         options.out.mkdir(parents=True, exist_ok=True)

@@ -9,11 +9,14 @@ import numpy as np
 import OpenImageIO
 
 from shared.errors import InputError
+from shared.geometry.eyeballs import fit_eyeball
 from shared.geometry.mesh import Mesh, midpoint_subdivision
+from shared.geometry.parts import EYES
 from shared.geometry.transforms import WORLD_FROM_CAMERA, rotation_from_vector
+from shared.imaging.turning_eyes import TurningEyes
 from shared.io.arrays import load_arrays, read_json
 from shared.io.exr_picture import read_rec709
-from shared.io.meshes import load_mesh, read_obj
+from shared.io.meshes import load_mesh, read_obj, read_obj_groups
 from shared.rendering.near_lamp import NearLamp
 from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
 
@@ -27,8 +30,8 @@ _LARGEST_LIGHT = 8192
 @dataclass(frozen=True)
 class Asset:
     """What is to be lit: mesh (mm, y up, facing +z) and maps by name; of a result also its light, poses [F, 4, 4] with
-    frame_index [F], intrinsics [3, 3] of the source frame, what moved in the clip, and its light's lamp where that
-    stands near."""
+    frame_index [F], intrinsics [3, 3] of the source frame, what moved in the clip, its light's lamp where that stands
+    near; of an export with a gaze, the eyes, and how they turn in each frame, eye_turn [F, 2, 2] radians."""
 
     mesh: Mesh
     maps: dict[str, np.ndarray]
@@ -38,6 +41,8 @@ class Asset:
     intrinsics: np.ndarray | None = None
     moves: str = "head"
     lamp: NearLamp | None = None
+    eyes: TurningEyes | None = None
+    eye_turn: np.ndarray | None = None
 
 
 def open_asset(path: Path, albedo: tuple[float, ...], specular: float, roughness: float) -> Asset:
@@ -83,6 +88,7 @@ def _open_result(path: Path) -> Asset:
         arrays["frame_index"],
         arrays["intrinsics"].astype(np.float64),
         *_light_of_clip(folder),
+        *_eyes_of_clip(folder, mesh, arrays),
     )
 
 
@@ -103,6 +109,17 @@ def _light_of_clip(folder: Path) -> tuple[str, NearLamp | None]:
             moves = "camera" if isinstance(model, dict) and model.get("moves") == "camera" else "head"
             return moves, NearLamp.of_record(lamp)
     raise InputError("neither run.json nor solve.json", where=str(folder), hint="name a complete result")
+
+
+def _eyes_of_clip(
+    folder: Path, mesh: Mesh, poses: dict[str, np.ndarray]
+) -> tuple[TurningEyes | None, np.ndarray | None]:
+    """The eyeballs of an export and how they turn; None where the gaze is not known."""
+    if "eye_turn" not in poses or not (folder / "mesh.obj").is_file():
+        return None, None
+    groups = read_obj_groups(folder / "mesh.obj")
+    right, left = (fit_eyeball(mesh, groups[name]) for name in EYES)
+    return TurningEyes(mesh, (right, left)), poses["eye_turn"]
 
 
 def _read_mesh(path: Path) -> Mesh:

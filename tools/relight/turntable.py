@@ -1,5 +1,5 @@
 """What a result looks like, to show to others: the head turning under three lights, a light turning about the head, and
-a sheet of its maps.
+a sheet of its maps. Where the gaze is known the eyes look as they did in the clip when the head was turned as far.
 
 Two videos (H.264 in MP4, see video.py) and a PNG in a folder beside the export, with a record of what they show. What
 the record says to be of this export and these settings is not made again; a file that is not as the record has it is
@@ -9,14 +9,15 @@ another's, and is not written over.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from shared.contract.hashing import hash_file
 from shared.errors import InputError
-from shared.geometry.transforms import world_from_head
+from shared.geometry.eyeballs import gaze_towards
+from shared.geometry.transforms import camera_centres, world_from_head
 from shared.io.arrays import read_json, write_json
 from shared.io.export_maps import MAPS
 from shared.io.exr_picture import read_rec709
@@ -38,6 +39,8 @@ TURNING_LIGHT = "low_sun"
 HEAD, LIGHT, SHEET = TURNTABLE
 RECORD = "turntable.json"
 RANGES = {"size": (64, 2048), "frames": (2, 2000), "fps": (1, 240)}
+GAZE_BLUR = np.radians(3.0)
+"""Standard deviation, over where the camera stands, of the frames that count."""
 _DIRECTIONS, _NODES = 768, 500
 _AT_ONCE = 8
 Progress = Callable[[Iterable, str, int], Iterable]
@@ -99,7 +102,7 @@ def write_turntable(export: Path, settings: TurntableSettings, progress: Progres
 
 def _state_of(export: Path, settings: TurntableSettings) -> dict:
     """What the pictures depend on: the files that they show, and the settings."""
-    shown = [export / "mesh.obj", *sorted((export / "maps").glob("*.exr"))]
+    shown = [export / "mesh.obj", export / "poses.npz", *sorted((export / "maps").glob("*.exr"))]
     if missing := [path for path in shown[:1] if not path.is_file()]:
         raise InputError("no export of a head", where=str(export), expected=missing[0].name)
     return {"export": {path.relative_to(export).as_posix(): hash_file(path) for path in shown}, **asdict(settings)}
@@ -123,6 +126,7 @@ def _views(asset: Asset, progress: Progress) -> HeadViews:
         asset.mesh, asset.maps, Sizes(directions=_DIRECTIONS, nodes=_NODES),
         progress=lambda items, label: progress(items, label, len(items) if hasattr(items, "__len__") else None),
         light_resolution=round((_DIRECTIONS / 6) ** 0.5),
+        eyes=asset.eyes,
     )
 
 
@@ -149,15 +153,33 @@ def head_at(asset: Asset, views: HeadViews, yaw_deg: float, size: int) -> np.nda
     pose = turned_head(asset.mesh, front.camera_from_head, yaw_deg, 0.0)
     turn = world_from_head(pose[None], "head")[0]
     lights = [light_in_head_space(studio_light(name), turn) for name in LIGHTS]
-    pictures = views.relit(lights, ViewCamera(pose, front.intrinsics, front.size))
+    pictures = views.relit(lights, looking(asset, replace(front, camera_from_head=pose)))
     return np.hstack([srgb_bytes(picture) for picture in pictures])
+
+
+def looking(asset: Asset, camera: ViewCamera) -> ViewCamera:
+    """The camera with the eyes as they looked when the clip's camera saw the head from that side: each eye's mean over
+    frames seen from about there, of the outermost ones beyond."""
+    if asset.eye_turn is None:
+        return camera
+    sides = gaze_towards(camera_centres(asset.poses))[:, 0]
+    side = gaze_towards(camera_centres(camera.camera_from_head[None]))[0, 0]
+    gaze = np.full((2, 2), np.nan)
+    for k in range(2):
+        is_open = np.isfinite(asset.eye_turn[:, k]).all(1)
+        if is_open.any():
+            own = sides[is_open]
+            weight = np.exp(-0.5 * np.square((own - np.clip(side, own.min(), own.max())) / GAZE_BLUR))
+            gaze[k] = weight @ asset.eye_turn[is_open, k] / weight.sum()
+    return replace(camera, gaze=gaze)
 
 
 def _write_light(
     path: Path, export: Path, asset: Asset, views: HeadViews, settings: TurntableSettings, progress: Progress
 ) -> None:
     def pictures() -> Iterator[np.ndarray]:
-        camera, light = orbit_camera(asset.mesh, 0.0, 0.0, settings.size), studio_light(TURNING_LIGHT)
+        camera = looking(asset, orbit_camera(asset.mesh, 0.0, 0.0, settings.size))
+        light = studio_light(TURNING_LIGHT)
         starts = range(0, settings.frames, _AT_ONCE)
         for start in progress(starts, LIGHT, len(starts)):
             frames = range(start, min(start + _AT_ONCE, settings.frames))
