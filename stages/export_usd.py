@@ -361,6 +361,7 @@ def method_records(job: Job, record: dict, solve: dict):
 def run(job: Job) -> None:
     """Writes the result's files, then the report about them."""
     from shared.compute.processor import use_baseline_opencv
+    from shared.compute.threads import share_out
     from shared.geometry.eyeballs import eyeballs_of
     from shared.geometry.mesh import shading_normals
     from shared.geometry.reduction import reduced
@@ -392,10 +393,12 @@ def run(job: Job) -> None:
     surface = read_surface(job, mesh)
     eyeballs = eyeballs_of(surface) or ()
     eyes = eyeballs if "eye_turn" in poses else ()
-    actions, said_of_them = find_actions(job, surface)
-    details = dict(zip(REDUCED_FACES, reduced(surface, tuple(REDUCED_FACES.values())), strict=True))
-    asset = describe_asset(job, mesh, eyes, actions, details, find_base(job, surface, writer),
-                           describe_capture(job, poses, frames), frames, writer, lamp)
+    work = (lambda: find_actions(job, surface), lambda: reduced(surface, tuple(REDUCED_FACES.values())),
+            lambda: find_base(job, surface, writer))
+    (actions, said_of_them), few, base = share_out(len(work), lambda k: work[k]())
+    details = dict(zip(REDUCED_FACES, few, strict=True))
+    asset = describe_asset(job, mesh, eyes, actions, details, base, describe_capture(job, poses, frames), frames,
+                           writer, lamp)
     write_assets(job, asset, eyeballs, poses, maps, far)
     views = render_views(job, writer, mesh, eyes, maps, envmap, poses, frames, solve)
     record = run_record(job, mesh, said_of_them, solve, time.perf_counter() - start)

@@ -20,11 +20,12 @@ ROUNDS, RINGS, SMOOTHINGS = 12, 6, 4
 
 @dataclass(frozen=True, eq=False)
 class SkinFolds:
-    """vertices [V, 3] mm at rest; faces [F, 3]: of the skin; free [V] bool: what may be smoothed; near [V, V]: mean of
-    the vertices around."""
+    """vertices [V, 3] mm at rest; faces [F, 3] of the skin and their normals [F, 3] at rest, as long as twice the area;
+    free [V] bool: what may be smoothed; near [V, V]: mean of the vertices around."""
 
     vertices: np.ndarray
     faces: np.ndarray
+    normals: np.ndarray
     free: np.ndarray
     near: sparse.csr_matrix
 
@@ -34,11 +35,12 @@ class SkinFolds:
         anything."""
         near = vertex_adjacency(faces, len(vertices))
         near = (sparse.diags(1.0 / np.maximum(np.asarray(near.sum(1)).ravel(), 1.0)) @ near).tocsr()
-        return cls(vertices, faces[free[faces].all(1)], free, near)
+        faces = faces[free[faces].all(1)]
+        return cls(vertices, faces, face_normals(vertices, faces), free, near)
 
     def folded(self, moves: np.ndarray) -> np.ndarray:
         """[F] bool: faces of the skin that displacements moves [V, 3] mm fold over or squeeze together."""
-        before, after = face_normals(self.vertices, self.faces), face_normals(self.vertices + moves, self.faces)
+        before, after = self.normals, face_normals(self.vertices + moves, self.faces)
         length, moved = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
         turned = (before * after).sum(1) < FOLDED_COSINE * length * moved
         return (turned | (moved < FOLDED_AREA * length)) & (length > 0.0)

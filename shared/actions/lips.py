@@ -14,7 +14,7 @@ import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
 from shared.geometry.intersections import crossing_edges, edges_beside
-from shared.geometry.mesh import normalised, vertex_adjacency, vertex_normals
+from shared.geometry.mesh import mesh_edges, normalised, vertex_adjacency, vertex_normals
 from shared.tracking.head_model import HeadModel
 
 CONTACT_MM, FACING_COSINE = 4.0, -0.3
@@ -35,14 +35,15 @@ ROUNDS, SMOOTHINGS = 8, 6
 @dataclass(frozen=True, eq=False)
 class LipContact:
     """own [n]: vertices with partners; partners [n, V]: their weights, of sum 1 in each row; near [V, V]: mean of a
-    vertex and those around it; gap [n] mm: to the partners at rest; at_rest [E, 2]: edges that cross faces then; faces
-    [F, 3]: of lips and mouth."""
+    vertex and those around it; gap [n] mm: to the partners at rest; faces [F, 3] and edges [E, 2]: of lips and mouth;
+    at_rest [K, 2]: edges that cross faces then."""
 
     faces: np.ndarray
     own: np.ndarray
     partners: sparse.csr_matrix
     near: sparse.csr_matrix
     gap: np.ndarray
+    edges: np.ndarray
     at_rest: np.ndarray
 
     @classmethod
@@ -75,7 +76,8 @@ class LipContact:
         near = sparse.diags(1.0 / np.asarray(near.sum(1)).ravel()) @ near
         across = normalised(normals[own] - partners @ normals)
         gap = ((partners @ vertices - vertices[own]) * across).sum(1)
-        return cls(faces, own, partners.tocsr(), near.tocsr(), gap, crossing_edges(vertices, faces))
+        edges = mesh_edges(faces)[0]
+        return cls(faces, own, partners.tocsr(), near.tocsr(), gap, edges, crossing_edges(vertices, faces, edges))
 
     def moved_by(self, moves: np.ndarray) -> bool:
         """Do displacements moves [V, 3] mm move lips?"""
@@ -100,7 +102,7 @@ class LipContact:
 
     def _crossing(self, placed: np.ndarray) -> np.ndarray:
         """Vertices of edges that pass through faces, and did not at rest."""
-        edges = crossing_edges(placed, self.faces)
+        edges = crossing_edges(placed, self.faces, self.edges)
         return np.unique(edges_beside(edges, self.at_rest))
 
     def _pushed(self, placed: np.ndarray, least: np.ndarray, share: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ shares in a frame is laid to light, pose and mesh: only finer relief counts. Equ
 resolve, so that no texel claims more, and the turn has a prior of none. Held-out frames say how wide the prior is and
 what share of the relief is true.
 
-References: [Horn1975] (shape from shading); [Mikkelsen2008] (tangents of MikkTSpace).
+Reference: [Horn1975] (shape from shading).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from shared.compute.compiled import compiled
 from shared.compute.read_ahead import work_ahead
 from shared.compute.run_context import SILENT, RunContext
 from shared.compute.threads import share_out
-from shared.geometry.mesh import Mesh, normalised, vertex_adjacency
+from shared.geometry.mesh import normalised, uv_tangents, vertex_adjacency
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import FrameView, TexelSurface
@@ -40,25 +40,6 @@ PRIORS = (0.05, 0.1, 0.2, 0.4)
 """Standard deviations in radians of what the mesh leaves out of the skin's normals; held-out frames choose."""
 LARGEST_TURN = 1.0
 """Tangent of the largest angle between the map's normal and the mesh's."""
-
-
-def uv_tangents(mesh: Mesh, normals: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
-    """[n, 2, 3] float32 at places on faces [n] with corner weights [n, 3]: unit directions of growing u and v.
-
-    normals [n, 3] unit. The faces' directions of u are averaged at each texture vertex and made orthogonal to the
-    normal at the place; the second direction is normal x first, turned to where v grows. face [n] int; bary [n, 3].
-    """
-    corners, uv = mesh.vertices[mesh.faces], mesh.uvs[mesh.face_uvs]
-    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    d1, d2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    sign = np.where(d1[:, 0] * d2[:, 1] - d2[:, 0] * d1[:, 1] >= 0, 1.0, -1.0)[:, None]
-    along_u = normalised(sign * (e1 * d2[:, 1:] - e2 * d1[:, 1:]))
-    total = np.zeros((len(mesh.uvs), 3))
-    for k in range(3):
-        np.add.at(total, mesh.face_uvs[:, k], along_u)
-    first = np.einsum("nk,nkx->nx", bary, total[mesh.face_uvs[face]])
-    first = normalised(first - (first * normals).sum(1, keepdims=True) * normals)
-    return np.stack([first, np.cross(normals, first) * sign[face]], axis=1).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -34,10 +34,10 @@ def crossing_edges(vertices: np.ndarray, faces: np.ndarray, edges: np.ndarray | 
     for first, sign in ((0, 1.0), (1, -1.0)):
         # From both ends: the first face met may be a neighbour of the edge that hides another.
         origins = vertices[edges[:, first]] + _ENDS * sign * along
-        face, _, distance = scene.intersect(origins, sign * along)
-        met = (face >= 0) & (distance < 1.0 - 2.0 * _ENDS)
-        own = (faces[face][:, :, None] == edges[:, None, :]).any((1, 2))
-        found |= met & ~own
+        face, _, distance = scene.intersect(origins, sign * along, farthest=1.0)
+        met = np.nonzero((face >= 0) & (distance < 1.0 - 2.0 * _ENDS))[0]
+        own = (faces[face[met]][:, :, None] == edges[met][:, None, :]).any((1, 2))
+        found[met[~own]] = True
     return edges[found]
 
 

@@ -90,6 +90,26 @@ def shading_normals(mesh: Mesh) -> np.ndarray:
     return normals
 
 
+def uv_tangents(mesh: Mesh, normals: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+    """[n, 2, 3] float32 at places on faces [n] with corner weights [n, 3]: unit directions of growing u and v.
+
+    normals [n, 3] unit. The faces' directions of u are averaged at each texture vertex and made orthogonal to the
+    normal at the place; the second direction is normal x first, turned to where v grows, as [Mikkelsen2008] has them.
+    face [n] int; bary [n, 3].
+    """
+    corners, uv = mesh.vertices[mesh.faces], mesh.uvs[mesh.face_uvs]
+    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    d1, d2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    sign = np.where(d1[:, 0] * d2[:, 1] - d2[:, 0] * d1[:, 1] >= 0, 1.0, -1.0)[:, None]
+    along_u = normalised(sign * (e1 * d2[:, 1:] - e2 * d1[:, 1:]))
+    total = np.zeros((len(mesh.uvs), 3))
+    for k in range(3):
+        np.add.at(total, mesh.face_uvs[:, k], along_u)
+    first = np.einsum("nk,nkx->nx", bary, total[mesh.face_uvs[face]])
+    first = normalised(first - (first * normals).sum(1, keepdims=True) * normals)
+    return np.stack([first, np.cross(normals, first) * sign[face]], axis=1).astype(np.float32)
+
+
 def half_edges(faces: np.ndarray) -> np.ndarray:
     """[F, 3] -> [3 F, 2]: each face's edges in its orientation; corners 0 and 1 of all faces, then 1 and 2, 2 and 0."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])

@@ -26,38 +26,43 @@ class RayScene:
         """[N, 3], [N, 3] -> [N] bool: does anything lie along the ray (any distance)?"""
         return self._traced(self.triangles.occluded, origins, directions) >= 0
 
-    def first_faces(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """[N, 3], [N, 3] -> the face that each ray meets first [N] int32, -1: none."""
-        return self._traced(self.triangles.intersect, origins, directions)
+    def first_faces(self, origins: np.ndarray, directions: np.ndarray, farthest: float = FAR) -> np.ndarray:
+        """[N, 3], [N, 3] -> the face that each ray meets first [N] int32, -1: none up to the farthest distance."""
+        return self._traced(self.triangles.intersect, origins, directions, farthest)
 
-    def intersect(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def intersect(
+        self, origins: np.ndarray, directions: np.ndarray, farthest: float = FAR
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """[N, 3], [N, 3] -> face [N] int32 (-1: nothing hit), bary [N, 3] corner weights, distance [N].
 
-        Distances are in units of the direction's length; where nothing is hit they are infinite. Which face it is
-        embree says; where on it, doubles do: each processor's embree approximates reciprocals in its own way.
+        Distances are in units of the direction's length; where nothing is hit they are infinite. Rays that end at the
+        farthest one that matters take less time. Which face it is embree says; where on it, doubles do: each
+        processor's embree approximates reciprocals in its own way.
         """
-        face = self.first_faces(origins, directions)
+        face = self.first_faces(origins, directions, farthest)
         bary, distance = np.zeros((len(face), 3), np.float32), np.full(len(face), np.inf, np.float32)
         hit = face >= 0
         bary[hit], distance[hit] = on_faces(self.vertices, self.faces, face[hit], origins[hit], directions[hit])
         face[np.isinf(distance)] = -1
         return face, bary, distance
 
-    def _traced(self, function: np.uint64, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    def _traced(
+        self, function: np.uint64, origins: np.ndarray, directions: np.ndarray, farthest: float = FAR
+    ) -> np.ndarray:
         """By embree's function -> face [N], -1 where nothing is hit."""
         origins, directions = np.asarray(origins, np.float32), np.asarray(directions, np.float32)
         face = np.empty(len(origins), np.int32)
-        _trace(function, self.triangles.scene, *ray_buffer(), origins, directions, face)
+        _trace(function, self.triangles.scene, *ray_buffer(), origins, directions, np.float32(farthest), face)
         return face
 
 
 @compiled
-def _trace(function, scene, ray, words, address, origins, directions, face):
+def _trace(function, scene, ray, words, address, origins, directions, farthest, face):
     """Rays [N, 3] -> face [N], -1: none."""
     for n in range(len(origins)):
         for k in range(3):
             ray[k], ray[4 + k] = origins[n, k], directions[n, k]
-        ray[FARTHEST] = FAR
+        ray[FARTHEST] = farthest
         words[MASK] = words[GEOMETRY] = -1
         call_embree(function, scene, address)
         face[n] = -1

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.eyeballs import EYE_ROUGHNESS, TEAR_FILM_IOR
-from shared.geometry.mesh import unique_pairs
+from shared.geometry.mesh import tangent_frames, unique_pairs, uv_tangents
 from shared.geometry.parts import HEAD, RigidPart
 from shared.io.export_maps import integer_codes
 from shared.io.images import texture_png
@@ -38,6 +38,7 @@ _FLOAT, _UINT, _USHORT = 5126, 5125, 5123
 _ARRAY, _INDEX = 34962, 34963
 _LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
 _FIRST_EYE = 2
+_SKIN, _EYE = 0, 1
 _EYE_MATERIAL = {
     "name": "eye",
     "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": EYE_ROUGHNESS},
@@ -117,7 +118,7 @@ def write_glb(
         nodes += [{"name": eye.name, "mesh": 1 + k, "translation": (eye.pivot * METRES_PER_MM).tolist()}
                   for k, eye in enumerate(turning)]
     targets = list(_morph_targets([shape.of_part(head.vertices) for shape in actions]))
-    meshes = [{"name": HEAD, "primitives": [_primitive(buffer, head, 0, targets)]}]
+    meshes = [{"name": HEAD, "primitives": [_primitive(buffer, head, _SKIN, targets)]}]
     if targets:
         meshes[0] |= {"weights": [0.0] * len(targets), "extras": {"targetNames": [shape.name for shape in targets]}}
     content = {
@@ -125,7 +126,7 @@ def write_glb(
         "scene": 0,
         "scenes": [{"name": name, "nodes": [0, 1]}],
         "nodes": nodes,
-        "meshes": meshes + [{"name": eye.name, "primitives": [_primitive(buffer, eye, 1)]} for eye in turning],
+        "meshes": meshes + [{"name": eye.name, "primitives": [_primitive(buffer, eye, _EYE)]} for eye in turning],
         "materials": [skin, _EYE_MATERIAL] if turning else [skin],
         "extensionsUsed": ["KHR_materials_ior", "KHR_materials_specular"] if turning else ["KHR_materials_specular"],
         "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
@@ -163,8 +164,9 @@ def _morph_targets(shapes: Sequence[BlendShape]) -> Iterator[BlendShape]:
 
 
 def _primitive(buffer: _Buffer, part: RigidPart, material: int, targets: Sequence[BlendShape] = ()) -> dict:
-    """glTF knows one index per corner: vertices are doubled along texture seams. targets: see _morph_targets; what they
-    move comes first, so that two bytes are enough for its indices."""
+    """glTF knows one index per corner: vertices are doubled along texture seams. The skin, which has a normal map, also
+    gets tangents. targets: see _morph_targets; what they move comes first, so that two bytes are enough for its
+    indices."""
     mesh = part.mesh
     corners, index, _ = unique_pairs(np.column_stack([mesh.faces.ravel(), mesh.face_uvs.ravel()]))
     moving = np.zeros(len(mesh.vertices), bool)
@@ -180,9 +182,24 @@ def _primitive(buffer: _Buffer, part: RigidPart, material: int, targets: Sequenc
     }
     primitive = {"attributes": attributes, "indices": buffer.array(index.astype(np.uint32), _INDEX),
                  "material": material}
+    if material == _SKIN:
+        tangents = np.empty((len(corners), 4))
+        tangents[index] = _tangents(part)
+        attributes["TANGENT"] = buffer.array(tangents, _ARRAY)
     if targets:
         primitive["targets"] = [_morph_target(buffer, vertex, target) for target in targets]
     return primitive
+
+
+def _tangents(part: RigidPart) -> np.ndarray:
+    """[3 F, 4] of the faces' corners: unit direction of growing u, and 1 where normal x tangent is that of growing v as
+    maps have it, upwards, else -1; any tangent where the UVs say none."""
+    mesh = part.mesh
+    normals, bary = part.normals[mesh.faces.ravel()], np.tile(np.eye(3), (len(mesh.faces), 1))
+    along, across = np.moveaxis(uv_tangents(mesh, normals, np.repeat(np.arange(len(mesh.faces)), 3), bary), 1, 0)
+    lost = np.linalg.norm(along, axis=1) < 0.5
+    along[lost] = tangent_frames(normals[lost])[:, 0]
+    return np.column_stack([along, np.where((np.cross(normals, along) * across).sum(1) < 0.0, -1.0, 1.0)])
 
 
 def _morph_target(buffer: _Buffer, vertex: np.ndarray, shape: BlendShape) -> dict[str, int]:

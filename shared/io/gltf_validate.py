@@ -319,7 +319,7 @@ class _Glb:
             yield f"{where}: {corners} corners in mode {primitive.get('mode', _TRIANGLES)}, expected whole triangles"
 
     def _uses(self, where: str, primitive: Mapping) -> Iterator[str]:
-        """The material, and whether the texture coordinates that it reads are there."""
+        """The material, and whether the texture coordinates and tangents that it reads are there."""
         if absent := self.missing(f"{where}/material", "materials", primitive["material"]):
             yield from absent
             return
@@ -327,6 +327,8 @@ class _Glb:
             coordinates = f"TEXCOORD_{texture.get('texCoord', 0)}"
             if coordinates not in primitive["attributes"]:
                 yield f"{where}: no {coordinates}, which its material's {name} reads"
+            if name == "normalTexture" and "TANGENT" not in primitive["attributes"]:
+                yield f"{where}: no TANGENT, so that each program makes its own for its material's {name}"
 
     def _target(self, where: str, target: Mapping, attributes: Mapping, count: int | None) -> Iterator[str]:
         for name, index in target.items():

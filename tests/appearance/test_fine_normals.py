@@ -13,10 +13,9 @@ from shared.appearance.fine_normals import (
     ReliefSums,
     most_likely_turns,
     normal_image,
-    uv_tangents,
 )
 from shared.appearance.texture import TexelMaterial
-from shared.geometry.mesh import interpolate, vertex_normals
+from shared.geometry.mesh import interpolate, uv_tangents, vertex_normals
 from shared.geometry.raycast import RayScene, camera_hits
 from shared.imaging.image_sampling import SurfaceViewer, prepare_picture
 from shared.imaging.texels import TexelSurface

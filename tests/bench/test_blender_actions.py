@@ -9,13 +9,10 @@ import subprocess
 
 import numpy as np
 import pytest
-from toy_result import ToyJob, write_toy_work
+from model_export import write_model_work
+from toy_result import ToyJob
 
 from shared.actions.facial import facial_actions
-from shared.geometry.mesh import Mesh
-from shared.io.arrays import read_json, write_json
-from shared.io.meshes import save_mesh
-from shared.tracking.fit_eyeballs import set_eyeballs
 from shared.tracking.models import load_head_model
 from stages import export_usd
 from tools.bench.peers.blender import VARIABLE, blender_python
@@ -43,16 +40,10 @@ print("FOUND" + json.dumps({"moved": moved, "values": [key.value for key in keys
 def exported(tmp_path_factory):
     """(the blend shapes, the export's folder) of the model's mean head."""
     base = tmp_path_factory.mktemp("blender_actions")
-    work = write_toy_work(base / "work", eyes=True)
-    coarse = load_head_model()
-    model = coarse.subdivided()
-    mesh = Mesh(set_eyeballs(model, model.template), model.faces, model.uvs, model.face_uvs)
-    save_mesh(work / "inverse_render" / "mesh.npz", mesh, face_segment=model.face_segment)
-    tracking = read_json(work / "track_landmarks" / "tracking.json")
-    write_json(work / "track_landmarks" / "tracking.json", tracking | {"segments": model.segment_names})
-    job = ToyJob(work, base / "export", views=False, plates=False)
+    work, mesh = write_model_work(base / "work")
+    job = ToyJob(work, base / "export", views=False, plates=False, viewer_detail="full")
     export_usd.run(job)
-    return facial_actions(coarse, mesh.vertices, mesh.faces), job.out
+    return facial_actions(load_head_model(), mesh.vertices, mesh.faces), job.out
 
 
 @pytest.mark.parametrize("file", ["head.usda", "head.usdz", "head.glb"])

@@ -8,35 +8,19 @@ import os
 import subprocess
 
 import numpy as np
-import OpenEXR
 import pytest
+from model_export import read_rgba, variant_scene, write_model_work
 from scipy.spatial import cKDTree
-from toy_result import ToyJob, write_toy_work
+from toy_result import ToyJob
 from trimesh.triangles import closest_point
 
-from shared.geometry.mesh import Mesh, vertex_normals
-from shared.io.arrays import read_json, write_json
-from shared.io.meshes import read_obj, save_mesh
-from shared.tracking.fit_eyeballs import set_eyeballs
-from shared.tracking.models import load_head_model
+from shared.io.arrays import read_json
+from shared.io.meshes import read_obj
 from stages import export_usd
 from tools.bench.peers.blender import VARIABLE, blender_python
 
 pytestmark = pytest.mark.skipif(not os.environ.get(VARIABLE), reason=f"needs Blender: set {VARIABLE} to its Python")
 
-SCENE = """#usda 1.0
-(
-    defaultPrim = "head"
-    metersPerUnit = 0.001
-    upAxis = "Y"
-)
-def "head" (
-    references = @./head.usda@
-    variants = {
-        string detail = "base"
-    }
-) {}
-"""
 RAISE = """
 import bpy, json, sys
 import numpy as np
@@ -82,18 +66,10 @@ print("FOUND" + json.dumps({
 def raised(tmp_path_factory):
     """(what Blender says, the export's folder) of the mean head with waves on its skin."""
     base = tmp_path_factory.mktemp("blender_base")
-    work = write_toy_work(base / "work", eyes=True)
-    model = load_head_model().subdivided()
-    vertices = set_eyeballs(model, model.template)
-    waves = 0.4 * np.sin(0.5 * vertices).prod(1) * ~model.surface(vertices).vertices_of(("eyes", "inner_mouth"))
-    vertices = vertices + waves[:, None] * vertex_normals(vertices, model.faces)
-    mesh = Mesh(vertices, model.faces, model.uvs, model.face_uvs)
-    save_mesh(work / "inverse_render" / "mesh.npz", mesh, face_segment=model.face_segment)
-    tracking = read_json(work / "track_landmarks" / "tracking.json")
-    write_json(work / "track_landmarks" / "tracking.json", tracking | {"segments": model.segment_names})
+    work, _ = write_model_work(base / "work", waves_mm=0.4)
     job = ToyJob(work, base / "export", usdz=False, glb=False, views=False, plates=False, report_frames=1)
     export_usd.run(job)
-    (job.out / "base.usda").write_text(SCENE, encoding="utf-8")
+    (job.out / "base.usda").write_text(variant_scene(detail="base"), encoding="utf-8")
     command = [blender_python(), "-c", RAISE, str(job.out)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return json.loads(done.stdout.partition("FOUND")[2].splitlines()[0]), job.out
@@ -111,8 +87,7 @@ def test_subdivision_and_displacement_arrive_as_stated(raised):
 def test_cycles_shows_the_full_head(raised):
     """Where the pixels of a render from the front lie in space, against the mesh: nearest places."""
     found, folder = raised
-    with OpenEXR.File(str(folder / "places.exr")) as file:
-        pixels = file.channels()["RGBA"].pixels.reshape(-1, 4).astype(np.float64)
+    pixels = read_rgba(folder / "places.exr").reshape(-1, 4)
     places = pixels[pixels[:, 3] > 0.99, :3]
     assert len(places) > 20_000
     places = np.linalg.solve(np.array(found["head"]), np.column_stack([places, np.ones(len(places))]).T).T[::5, :3]

@@ -24,7 +24,7 @@ from toy_result import (
 
 from shared.geometry.blend_shapes import BlendShape, with_normals
 from shared.geometry.eyeballs import eyeballs_of, gaze_rotation
-from shared.geometry.mesh import vertex_normals
+from shared.geometry.mesh import uv_tangents, vertex_normals
 from shared.geometry.parts import head_parts
 from shared.imaging.color import encode_srgb
 from shared.io.gltf import write_glb
@@ -93,6 +93,26 @@ def test_geometry_in_metres_with_v_downwards(file):
     np.testing.assert_allclose(positions, mesh.vertices[mesh.faces] * 0.001, atol=1e-7)
     np.testing.assert_allclose(normals, vertex_normals(mesh.vertices, mesh.faces)[mesh.faces], atol=1e-6)
     np.testing.assert_allclose(uvs * [1, -1] + [0, 1], mesh.uvs[mesh.face_uvs], atol=1e-6)
+
+
+def test_tangents_are_those_of_the_normal_map(file):
+    """Corner by corner the direction of growing u, and of growing v as the map's rows have it, upwards."""
+    mesh = toy_mesh()
+    content, binary = chunks(file)
+    primitive = content["meshes"][0]["primitives"][0]
+    index = accessor(content, binary, primitive["indices"])[:, 0]
+    normals, tangents = (accessor(content, binary, primitive["attributes"][name])[index].astype(float)
+                         for name in ("NORMAL", "TANGENT"))
+    np.testing.assert_allclose(np.linalg.norm(tangents[:, :3], axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose((tangents[:, :3] * normals).sum(1), 0.0, atol=1e-5)
+    face, bary = np.repeat(np.arange(len(mesh.faces)), 3), np.tile(np.eye(3), (len(mesh.faces), 1))
+    expected = uv_tangents(mesh, normals, face, bary)
+    known = np.linalg.norm(expected[:, 0], axis=1) > 0.5
+    assert known.mean() > 0.9
+    np.testing.assert_allclose(tangents[known, :3], expected[known, 0], atol=1e-5)
+    up = np.cross(normals, tangents[:, :3]) * tangents[:, 3:]
+    # The toy's faces that span its map from side to side are mirrored there, at corners that they share.
+    assert (np.abs(up[known] - expected[known, 1]).max(1) < 1e-4).mean() > 0.9
 
 
 def test_another_reader_agrees(file):

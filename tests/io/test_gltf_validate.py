@@ -215,6 +215,7 @@ FAULTS = [
     ("1 numbers are not finite", number("TEXCOORD_0", np.nan, 7, 0)),
     ("1 of", number("NORMAL", 2.0, 4, 0)),
     ("handedness", bad_tangents),
+    ("no TANGENT, so that", lambda g: g.primitive["attributes"].pop("TANGENT")),
     ("/POSITION: neither min nor max", lambda g: g.content["accessors"][g.attribute("POSITION")].pop("min")),
     ("no POSITION", lambda g: g.primitive["attributes"].pop("POSITION")),
     ("/NORMAL: points to accessors 999", lambda g: g.primitive["attributes"].update(NORMAL=999)),

@@ -5,15 +5,12 @@ import struct
 
 import numpy as np
 import pytest
+from model_export import write_model_work
 from pxr import Usd, UsdGeom, UsdSkel
 from toy_result import ToyJob, write_toy_work
 
 from shared.actions.names import ARKIT_NAMES
-from shared.geometry.mesh import Mesh
-from shared.io.arrays import read_json, write_json
-from shared.io.meshes import save_mesh
-from shared.tracking.fit_eyeballs import set_eyeballs
-from shared.tracking.models import load_head_model
+from shared.io.arrays import read_json
 from stages import export_usd
 
 
@@ -21,12 +18,7 @@ from stages import export_usd
 def exported(tmp_path_factory):
     """{actions on?: the job}, of the same head."""
     base = tmp_path_factory.mktemp("actions")
-    work = write_toy_work(base / "work", eyes=True)
-    model = load_head_model().subdivided()
-    mesh = Mesh(set_eyeballs(model, model.template), model.faces, model.uvs, model.face_uvs)
-    save_mesh(work / "inverse_render" / "mesh.npz", mesh, face_segment=model.face_segment)
-    tracking = read_json(work / "track_landmarks" / "tracking.json")
-    write_json(work / "track_landmarks" / "tracking.json", tracking | {"segments": model.segment_names})
+    work, _ = write_model_work(base / "work")
     jobs = {}
     for on in (True, False):
         jobs[on] = ToyJob(work, base / f"export_{on}", actions=on, views=False, plates=False)

@@ -4,39 +4,29 @@ import re
 
 import numpy as np
 import pytest
+from model_export import HIDDEN, write_model_work
 from pxr import Usd, UsdGeom, UsdShade, UsdSkel
-from toy_result import ToyJob, write_toy_work
+from toy_result import ToyJob
 
-from shared.geometry.mesh import Mesh, vertex_normals
+from shared.geometry.mesh import vertex_normals
 from shared.geometry.quads import LimitSurface, QuadMesh
 from shared.geometry.raycast import RayScene
 from shared.imaging.texture import sample_bilinear
-from shared.io.arrays import read_json, write_json
 from shared.io.exr_header import read_parts
 from shared.io.images import read_exr
-from shared.io.meshes import read_obj, save_mesh
-from shared.tracking.fit_eyeballs import set_eyeballs
+from shared.io.meshes import read_obj
 from shared.tracking.models import load_head_model
 from stages import export_usd
 from tools.documents.readme import DOCS
 
 TOLERANCE_MM = 0.02
-HIDDEN = ("eyes", "eye_sockets", "inner_mouth")
 
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     """The job, of the mean head with waves on its skin that no quad can follow."""
     base = tmp_path_factory.mktemp("base")
-    work = write_toy_work(base / "work", eyes=True)
-    model = load_head_model().subdivided()
-    vertices = set_eyeballs(model, model.template)
-    waves = 0.4 * np.sin(0.5 * vertices).prod(1) * ~model.surface(vertices).vertices_of(HIDDEN)
-    vertices = vertices + waves[:, None] * vertex_normals(vertices, model.faces)
-    mesh = Mesh(vertices, model.faces, model.uvs, model.face_uvs)
-    save_mesh(work / "inverse_render" / "mesh.npz", mesh, face_segment=model.face_segment)
-    tracking = read_json(work / "track_landmarks" / "tracking.json")
-    write_json(work / "track_landmarks" / "tracking.json", tracking | {"segments": model.segment_names})
+    work, _ = write_model_work(base / "work", waves_mm=0.4)
     job = ToyJob(work, base / "export", glb=False, views=False, plates=False, report_frames=1)
     export_usd.run(job)
     export_usd.check(job)
