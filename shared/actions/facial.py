@@ -17,7 +17,6 @@ from shared.actions.folds import SkinFolds
 from shared.actions.lips import LipContact
 from shared.actions.names import named_actions
 from shared.actions.transfer import carried, local_similarities
-from shared.compute.threads import share_out
 from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.eyeballs import SIDES
 from shared.tracking.head_model import HeadModel
@@ -56,10 +55,8 @@ def facial_actions(model: HeadModel, vertices: np.ndarray, faces: np.ndarray) ->
     maps, lids = _maps(model, levels, vertices), Eyelids.of(finer, vertices, splits=len(levels) - 1)
     lips, surface = LipContact.of(finer, vertices), finer.surface(vertices)
     still, skin = surface.vertices_of(("eyes",)), SkinFolds.of(vertices, faces, ~surface.vertices_of(TOUCHING))
-    actions = list(named_actions(finer).items())
-
-    def shape(number: int) -> BlendShape:
-        name, moves = actions[number]
+    shapes = []
+    for name, moves in named_actions(finer).items():
         moved, between = np.where(still[:, None], 0.0, carried(moves, maps)), ()
         if lids is not None and name in BLINKS:
             moved, half = lids.blink(BLINKS.index(name), moves, moved)
@@ -68,9 +65,8 @@ def facial_actions(model: HeadModel, vertices: np.ndarray, faces: np.ndarray) ->
             moved = skin.smoothed(lids.clear_of_balls(moved))
         if lips is not None and lips.moved_by(moved):
             moved = lips.parted(vertices + moved) - vertices
-        return BlendShape.of(name, moved, LEAST_MM, between)
-
-    return tuple(shape for shape in share_out(len(actions), shape) if len(shape.vertices))
+        shapes.append(BlendShape.of(name, moved, LEAST_MM, between))
+    return tuple(shape for shape in shapes if len(shape.vertices))
 
 
 def _maps(model: HeadModel, levels: list[HeadModel], vertices: np.ndarray) -> np.ndarray:

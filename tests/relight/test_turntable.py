@@ -19,7 +19,16 @@ from tools.relight import turntable
 from tools.relight.inputs import open_asset
 from tools.relight.map_sheet import LABEL_PX, TILE_PX, map_sheet
 from tools.relight.options import CLAY
-from tools.relight.turntable import HEAD, LIGHT, RECORD, SHEET, TurntableSettings, looking, write_turntable
+from tools.relight.turntable import (
+    FARTHEST_GAZE,
+    HEAD,
+    LIGHT,
+    RECORD,
+    SHEET,
+    TurntableSettings,
+    looking,
+    write_turntable,
+)
 
 SMALL = ("--size", "64", "--frames", "3")
 
@@ -73,23 +82,23 @@ def test_lights_stand_still_while_the_head_turns_and_turn_while_it_does_not(orig
     assert turned[0][1] > 1.2 * turned[0][0] and any(left > right for left, right in turned[1:])
 
 
-def test_eyes_look_as_they_did_in_the_clip_from_there(original):
-    """The toy's gaze by the side from which the clip saw the head; behind the outermost poses theirs; without a gaze as
-    the camera was."""
+def test_eyes_do_as_they_did_in_the_clip(original):
+    """On the camera, or still in the head, or anything between; not farther aside than eyes go; without a gaze the
+    camera is as it was."""
     asset = open_asset(original / "export", **CLAY)
     assert asset.eyes is not None and asset.eye_turn.shape == (len(FRAMES), 2, 2)
     np.testing.assert_allclose([ball.centre for ball in asset.eyes.balls], EYE_CENTRES, atol=1e-3)
-    gaze = np.repeat(np.linspace(-0.2, 0.2, len(asset.poses))[:, None, None], 2, axis=1) * [1.0, 0.5]
-    gaze[2, 0] = np.nan
-    sides = np.radians(30.0) * np.linspace(-1.0, 1.0, len(asset.poses))
+    sides = np.radians([-20.0, -11.0, 0.0, 8.0, 18.0])
     poses = np.array([orbit_camera(asset.mesh, np.degrees(side), 0.0, 64).camera_from_head for side in sides])
-    asset = replace(asset, poses=poses, eye_turn=gaze)
-    front = orbit_camera(asset.mesh, 0.0, 0.0, 64)
-    for side in (0, 2, 4):
-        found = looking(asset, replace(front, camera_from_head=poses[side])).gaze
-        np.testing.assert_allclose(found[1], gaze[side, 1], atol=0.02)
-    behind = looking(asset, orbit_camera(asset.mesh, 150.0, 0.0, 64)).gaze
-    np.testing.assert_allclose(behind, gaze[-1], atol=0.02)
+    front, aside, behind = (orbit_camera(asset.mesh, yaw, 0.0, 64) for yaw in (0.0, 20.0, 150.0))
+    for slope, expected in ((1.0, (0.05, 0.05 + np.radians(20.0), FARTHEST_GAZE)), (0.0, (0.05, 0.05, 0.05)),
+                            (0.4, (0.05, 0.05 + 0.4 * np.radians(20.0), FARTHEST_GAZE))):
+        gaze = np.stack([0.05 + slope * sides, np.full(len(sides), -0.1)], axis=1)
+        turn = np.repeat(gaze[:, None], 2, axis=1)
+        turn[2, 0] = np.nan
+        own = replace(asset, poses=poses, eye_turn=turn)
+        for camera, yaw in zip((front, aside, behind), expected, strict=True):
+            np.testing.assert_allclose(looking(own, camera).gaze, [[yaw, -0.1]] * 2, atol=0.01)
     assert looking(replace(asset, eye_turn=None), front) is front
 
 

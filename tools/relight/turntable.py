@@ -1,5 +1,6 @@
 """What a result looks like, to show to others: the head turning under three lights, a light turning about the head, and
-a sheet of its maps. Where the gaze is known the eyes look as they did in the clip when the head was turned as far.
+a sheet of its maps. Where the gaze is known the eyes do as they did in the clip: stay on the camera, or go with the
+head.
 
 Two videos (H.264 in MP4, see video.py) and a PNG in a folder beside the export, with a record of what they show. What
 the record says to be of this export and these settings is not made again; a file that is not as the record has it is
@@ -39,8 +40,9 @@ TURNING_LIGHT = "low_sun"
 HEAD, LIGHT, SHEET = TURNTABLE
 RECORD = "turntable.json"
 RANGES = {"size": (64, 2048), "frames": (2, 2000), "fps": (1, 240)}
-GAZE_BLUR = np.radians(3.0)
-"""Standard deviation, over where the camera stands, of the frames that count."""
+FARTHEST_GAZE, LEAST_TURN = np.radians([25.0, 1.0])
+"""So far eyes follow a camera that goes round, if they did not look farther aside in the clip. Of a head that turned by
+less than the second it is not known what its eyes do."""
 _DIRECTIONS, _NODES = 768, 500
 _AT_ONCE = 8
 Progress = Callable[[Iterable, str, int], Iterable]
@@ -158,8 +160,8 @@ def head_at(asset: Asset, views: HeadViews, yaw_deg: float, size: int) -> np.nda
 
 
 def looking(asset: Asset, camera: ViewCamera) -> ViewCamera:
-    """The camera with the eyes as they looked when the clip's camera saw the head from that side: each eye's mean over
-    frames seen from about there, of the outermost ones beyond."""
+    """The camera with the eyes as they would look if it were the clip's: each eye's yaw is a line over the side from
+    which the camera sees the head, of a slope from 0, eyes that go with the head, to 1, eyes on the camera."""
     if asset.eye_turn is None:
         return camera
     sides = gaze_towards(camera_centres(asset.poses))[:, 0]
@@ -168,9 +170,11 @@ def looking(asset: Asset, camera: ViewCamera) -> ViewCamera:
     for k in range(2):
         is_open = np.isfinite(asset.eye_turn[:, k]).all(1)
         if is_open.any():
-            own = sides[is_open]
-            weight = np.exp(-0.5 * np.square((own - np.clip(side, own.min(), own.max())) / GAZE_BLUR))
-            gaze[k] = weight @ asset.eye_turn[is_open, k] / weight.sum()
+            own, (yaw, pitch) = sides[is_open], asset.eye_turn[is_open, k].T
+            away = own - own.mean()
+            slope = np.clip(away @ yaw / (away @ away + len(own) * LEAST_TURN**2), 0.0, 1.0)
+            farthest = max(FARTHEST_GAZE, np.abs(yaw).max())
+            gaze[k] = np.clip(yaw.mean() + slope * (side - own.mean()), -farthest, farthest), pitch.mean()
     return replace(camera, gaze=gaze)
 
 
