@@ -185,12 +185,11 @@ def _nearer(few: Mesh, whole: Mesh) -> Mesh:
 
 def _distance_along(whole: Mesh, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """[N] mm from points [N, 3] to the surface along directions [N, 3], below 0 against them, whichever is nearer among
-    faces that face the same way; infinite where there is none within FARTHEST_MM."""
+    faces that face the same way; infinite where there is none."""
     scene, facing = RayScene(whole.vertices, whole.faces), face_normals(whole.vertices, whole.faces)
     found = np.full(len(points), np.inf)
     for sign in (1.0, -1.0):
-        origins, reach = points - sign * RAY_START_MM * directions, FARTHEST_MM + 2.0 * RAY_START_MM
-        face, _, distance = scene.intersect(origins, sign * directions, reach)
+        face, _, distance = scene.intersect(points - sign * RAY_START_MM * directions, sign * directions)
         hit = np.nonzero(face >= 0)[0]
         hit = hit[(facing[face[hit]] * directions[hit]).sum(1) > 0.0]
         signed = sign * (distance[hit].astype(np.float64) - RAY_START_MM)

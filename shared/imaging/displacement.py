@@ -156,7 +156,7 @@ def _along_normals(scene: RayScene, places: np.ndarray, normals: np.ndarray, tar
         for side in (reach, -reach):
             start = guess[left] + side
             origins, directions = places[left] + start[:, None] * normals[left], -np.sign(side) * normals[left]
-            distance = scene.intersect(origins, directions, 2.0 * reach)[2].astype(np.float64)
+            distance = scene.intersect(origins, directions)[2].astype(np.float64)
             hit = np.where(distance < 2.0 * reach, start - np.sign(side) * distance, np.nan)
             apart = np.linalg.norm(places[left] + hit[:, None] * normals[left] - target[left], axis=1)
             nearer = apart < off

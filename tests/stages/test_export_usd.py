@@ -353,8 +353,13 @@ def test_usdz_is_stored_and_aligned(exported):
 
 
 def test_usdz_holds_the_same_asset(exported):
-    """One layer with both variants, the same mesh, motion, camera and light; textures within 8-bit coding."""
+    """One layer with all variants but the full mesh, the same reduced mesh, motion, camera and light; textures within
+    8-bit coding."""
     whole, packed = (Usd.Stage.Open(str(exported["head"] / name)) for name in ("head.usda", "head.usdz"))
+    levels = packed.GetDefaultPrim().GetVariantSet(DETAIL_SET)
+    assert (levels.GetVariantSelection(), levels.GetVariantNames()) == ("20k", ["20k", "5k"])
+    whole.SetEditTarget(whole.GetSessionLayer())
+    assert whole.GetDefaultPrim().GetVariantSet(DETAIL_SET).SetVariantSelection("20k")
     assert len(packed.GetLayerStack(includeSessionLayers=False)) == 1 and len(packed.GetUsedLayers()) <= 2
     for name in ("geo/head", "capture/camera", "capture/light", "mtl/skin/openpbr_surface"):
         first, second = (stage.GetDefaultPrim().GetPrimAtPath(name) for stage in (whole, packed))
