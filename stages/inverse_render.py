@@ -13,10 +13,11 @@ Method   What no track reaches (ears, skull, jaw) moves until the mesh's outline
          new ones. Light is summed along directions that lie close where a small lamp passes. Where there is one, it
          stands at the distance that held-out frames ask for, far away if they ask for none
          (shared/inverse/lamp_distance.py). Exposure that drifts is a gain of each frame (shared/inverse/exposure.py).
-         Or (model=auto) the model is chosen first, on few points and frames: shared/selection/candidates.py. Then
-         albedo and specular intensity per texel in closed form, streaming over the frames; samples where a cast shadow
-         ends, which the mesh tells to millimetres only, count less. The solver starts from a uniform light and the
-         priors: of one clip it needs no start from init_albedo, which is an input for comparison only.
+         Or (model=auto) how many numbers describe the light, and whether there are highlights, is chosen first, on few
+         points and frames: shared/selection/candidates.py. Then albedo and specular intensity per texel in closed form,
+         streaming over the frames; samples where a cast shadow ends, which the mesh tells to millimetres only, count
+         less. The solver starts from a uniform light and the priors: of one clip it needs no start from init_albedo,
+         which is an input for comparison only.
          Or (solver=reference) as published: shared/published/solver.py.
          Several clips of one head under different lights are solved as one (shared/inverse/joint_clips.py): one mesh
          and one set of maps, a light and poses of each. What lies at the top is the first clip's then, and clips/ holds
@@ -99,9 +100,9 @@ STAGE = Stage(
         Parameter("light_model", str, "cubemap", "What is unknown of the light: every texel of a cubemap, spherical "
                   "harmonics of its logarithm, one sun and a sky, or a lamp at the camera.", choices=LIGHT_MODELS),
         Parameter("model", str, "full", "Solve the full model that the other parameters describe, or climb towards it "
-                  "only as far as held-out frames fit better for it.", choices=MODELS),
+                  "only as far as held-out frames, and what is known of skin, ask for it.", choices=MODELS),
         Parameter("fixed_parts", str, "", "Parts of the model that model=auto leaves as the other parameters say, "
-                  "separated by commas: visibility, specular, light, geometry, roughness.", former="forced"),
+                  "separated by commas: light, specular.", former="forced"),
         Parameter("lamp_distance", str, "auto", "How far the light's main lamp stands from the head: auto, as near as "
                   "the frames ask for, far, or so many mm."),
         Parameter("points", int, 4000, "Surface points that the light is solved from.", "", 200, 40000),

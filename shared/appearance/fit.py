@@ -108,10 +108,9 @@ class Solution:
     """The last state of those that are best by held-out residual; iterations: one record per step; fitted and held_out:
     its residuals; local_roughness_fit: where roughness varies over the skin, how, and roughness_record what the
     held-out frames said to that; highlights_count: whether highlights took part to the end; frame_errors [F]: each
-    frame's mean absolute residual; local_specular: where the specular intensity varies with the face's segments, how;
-    light_weights: of several lights, how much samples of each count against those of the light that the model follows
-    best; lamp: of the light, where it stands near; scale: between light and albedo, with its covariance, None where it
-    was not at rest."""
+    frame's mean absolute residual; light_weights: of several lights, how much samples of each count against those of
+    the light that the model follows best; lamp: of the light, where it stands near; scale: between light and albedo,
+    with its covariance, None where it was not at rest."""
 
     state: AppearanceState
     iterations: tuple[dict, ...]
@@ -121,7 +120,6 @@ class Solution:
     roughness_record: dict = field(default_factory=dict)
     highlights_count: bool = True
     frame_errors: np.ndarray | None = None
-    local_specular: SpecularEquations | None = None
     light_weights: tuple[float, ...] = ()
     lamp: NearLamp | None = None
     scale: ResolvedScale | None = None

@@ -182,12 +182,13 @@ SOLVED_POSES = (POSES, replace(COVARIANCE, optional=True), FRAME_INDEX, SOURCE_L
                 GAIN)
 _REFERENCE = "solver=reference only:"
 _CANDIDATES = (
-    Field("part", "Part of the model.", "text"),
+    Field("part", "Part of the model: `light` or `specular`; `start` for the simplest model.", "text"),
     Field("candidate", "The choice that was tried for it.", "text"),
-    Field("held_out", "Error on the held-out frames."),
+    Field("held_out", "Error on the held-out frames, raised by what the prior on skin says against the albedo."),
     Field("fall", "By how much that is less than before.", "number or null"),
     Field("standard_error", "Standard error of the fall.", "number or null"),
     Field("accepted", "Whether the choice was kept.", "bool"),
+    Field("open", "Whether the held-out frames left it open: then the fuller choice is kept.", "bool"),
 )
 
 
@@ -207,8 +208,7 @@ _MODEL = (
     Field("model.roughness", "The typical roughness."),
     Field("model.roughness_variation", "Whether the roughness varies over the skin, and why; empty where it was not "
           "tried.", ""),
-    Field("model.roughness_variation.chosen", "`one` value or `local`; with model=auto the name of the choice.", "text",
-          optional=True),
+    Field("model.roughness_variation.chosen", "`one` value or `local`.", "text", optional=True),
     Field("model.roughness_variation.found_range", "5th and 95th percentile of the local roughness.", shape="2",
           optional=True),
     Field("model.roughness_variation.held_out", "Error on the held-out frames.", "", optional=True),

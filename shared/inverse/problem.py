@@ -34,8 +34,7 @@ class InverseSettings:
 
     shape: how the mesh is refined, None: it stays as it is; fit_frames: how many frames to fit, chosen to cover the
     face, 0: all but those held out; reference: solve by the published algorithm instead; selection: choose the model,
-    up to what the settings say, and leave only the named parts of it as they say; specular_widths: over which, relative
-    to the map, texels share their specular intensity: what held-out frames choose from; pose_rounds: how often, at
+    up to what the settings say, and leave only the named parts of it as they say; pose_rounds: how often, at
     most, the frames are tracked again on the refined mesh; lamp_distance: of the light's main lamp, mm, FAR or, None,
     where held-out frames have it."""
 
@@ -49,7 +48,6 @@ class InverseSettings:
     reference: ReferenceSettings | None = None
     normal_map: bool = True
     selection: frozenset[str] | None = None
-    specular_widths: tuple[float, ...] = (np.inf, 1 / 16, 1 / 64)
     pose_rounds: int = 3
     lamp_distance: float | None = None
 

@@ -46,6 +46,8 @@ from shared.shape.refine import meet_outline, surface_error
 
 LEAST_SEEN_SHARE = 0.01
 """Of the map: a clip that shows less of it gives no result, and one that determines less gives a warning."""
+SPECULAR_WIDTHS = (np.inf, 1 / 16, 1 / 64)
+"""Relative to the map: over which texels share their specular intensity, for held-out frames to choose from."""
 HAIRLINE_MM = 10.0
 """Bends of the hairline shorter than this are the mesh's, not the hair's."""
 
@@ -70,17 +72,16 @@ def solve_clip(
         surface, outline = meet_outline(some_views(views, settings, contour.frames), surface, contour, context)
         viewer = SurfaceViewer.of(surface.mesh)
     chart, chart_warning = said_by_chart(observations, viewer, views, settings)
-    selected = SelectedModel(surface, settings)
+    selected = SelectedModel(settings)
     if settings.selection is not None:
         selected = select(views, surface, settings, chart, context)
-    settings, shape_record = selected.settings, selected.shape_record
+    settings = selected.settings
 
-    # Light on the mesh as it was tracked, or as model selection left it.
+    # Light on the mesh as it was tracked.
     light_views = some_views(views, settings, settings.light_frames)
-    lit = LitSurface.of(selected.surface, light_views, settings, chart, context)
-    keeps_start = settings.selection is not None and selected.start is not None
+    lit = LitSurface.of(surface, light_views, settings, chart, context)
     solution = fit_appearance(lit.coarse, settings.appearance, report_to(context), start=selected.start,
-                              keep_start=keeps_start)
+                              keep_start=selected.start is not None)
 
     # A lamp that stands near, where held-out frames ask for one.
     by_lamp = find_lamp(lit, solution, light_views, settings, chart, context)
@@ -92,7 +93,7 @@ def solve_clip(
         steady = [observation.over(exposure.gain[observation.frame]) for observation in observations]
         chart, chart_warning = said_by_chart(steady, viewer, views, settings)
         light_views = some_views(views, settings, settings.light_frames)
-        lit = LitSurface.of(selected.surface, light_views, settings, chart, context)
+        lit = LitSurface.of(surface, light_views, settings, chart, context)
         solution = fit_appearance(lit.coarse, settings.appearance, report_to(context), start=exposure.solution,
                                   shapes=True)
         by_lamp = find_lamp(lit, solution, light_views, settings, chart, context)
@@ -101,11 +102,9 @@ def solve_clip(
     # Then closer directions where a lamp shines, the mesh refined under that light, and the poses anew on that mesh.
     shaped = shape_and_turn(views, lit, solution, settings, chart, tracked, context)
     views, lit, solution = shaped.views, shaped.lit, shaped.solution
-    shape_record = shape_record | shaped.shape_record
+    shape_record = {"refined": False} | shaped.shape_record
     if lit.coarse is not lit.capture:
         solution = fit_all_points(lit.capture, settings.appearance, solution, report_to(context))
-    if selected.variation is not None:
-        solution = selected.variation.worn_by(solution)
     diagnostics, solution, whites = examine(lit, settings.appearance, solution)
 
     # Under that light, of that shape: every texel's material, and relief finer than the mesh.
@@ -119,11 +118,11 @@ def solve_clip(
     eye_texels = None if eyes is None else EyeTexels(texels, viewer, eyes, surface.faces_of(LIDS))
     typical = np.median(solution.state.albedo, axis=0)
     texture = TexturePass(
-        texels, viewer, shading, views, specular=specular_at(texels, solution), typical_albedo=typical,
+        texels, viewer, shading, views, specular=solution.state.specular, typical_albedo=typical,
         light_weights=solution.light_weights, region=scalp_of(surface), bare=surface.vertices_of(FACE_SKIN),
         context=context, eyes=eye_texels,
     )
-    widths = settings.map_size * np.array(settings.specular_widths if settings.appearance.specular else (np.inf,))
+    widths = settings.map_size * np.array(SPECULAR_WIDTHS if settings.appearance.specular else (np.inf,))
     material, texture_record = texture.run(widths)
     turn, relief = None, {}
     if settings.normal_map:
@@ -195,14 +194,6 @@ def scalp_of(surface: Surface) -> np.ndarray | None:
     return diffused(surface.vertices_of(("scalp",)).astype(float), faces, steps) > 0.5
 
 
-def specular_at(surface: TexelSurface, solution: Solution) -> float | np.ndarray:
-    """The specular intensity that texels start from: one, or each its own [T]."""
-    if solution.local_specular is None:
-        return solution.state.specular
-    intensity = solution.local_specular.specular_at(surface.interpolate(surface.mesh.vertices))
-    return np.clip(intensity, *SPECULAR_RANGE)
-
-
 def describe_light(state) -> str:
     """The light's model in words."""
     model, numbers = state.light_model, len(state.params)
@@ -219,7 +210,7 @@ def summarise(result: InverseResult, moves: str) -> dict:
         "model": {
             "light": describe_light(state),
             "specular_intensity": round(state.specular, 4),
-            "specular_variation": "by segment" if solution.local_specular else result.record["texture"]["chosen"],
+            "specular_variation": result.record["texture"]["chosen"],
             "contradicted_texels": result.record["texture"]["contradicted"]["chosen"],
             "roughness": round(state.roughness, 4),
             "roughness_variation": solution.roughness_record,

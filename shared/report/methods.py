@@ -183,8 +183,9 @@ def _transfer(parameters: Mapping[str, object]) -> Iterable[str]:
         yield f"{known} computed once in head space and reused by all frames {{Sloan2002}}."
     light = _LIGHTS.get(str(parameters.get("light_model")))
     if parameters.get("model") == "auto":
-        yield ("The model of light, visibility, highlights and shape was chosen step by step, where the error on "
-               "held-out frames fell by more than its standard error {Breiman1984}.")
+        yield ("The model of light and highlights was chosen step by step, where the error on held-out frames, joined "
+               "with what the prior on skin says against the albedo, fell; what its standard error left open "
+               "{Breiman1984} was solved in the fuller model.")
     elif light:
         yield (f"The light was modelled as {light}, and solved by Gauss-Newton steps with the albedo eliminated "
                "{Golub1973} {Kaufman1975}.")

@@ -266,7 +266,7 @@ def course_chart(iterations: Sequence[Mapping[str, float]]) -> str:
 
 def selection_rows(selection: Sequence[Mapping]) -> list[list[str]]:
     """The models that were tried, candidate by candidate."""
-    keys = ("part", "candidate", "held_out", "fall", "standard_error", "accepted", "seconds")
+    keys = ("part", "candidate", "held_out", "fall", "standard_error", "accepted", "open", "seconds")
     errors = ("held_out", "fall", "standard_error")
     return [[f"{row[key]:.6f}" if key in errors and row[key] is not None else number(row[key]).replace("_", " ")
              for key in keys] for row in selection]

@@ -2,20 +2,19 @@
 
 Each part of the model has candidates of its own, from the least to the most:
 
-    visibility  off, on, bounces
     light       harmonics_2, sun_sky, harmonics_4, cubemap_8, cubemap_16, cubemap_32
-    specular    none, one_value; by_segment, local (selection/specular.py)
-    geometry    tracked, refined, subdivided (inverse/model_selection.py)
-    roughness   one_value; by_segment, local (selection/specular.py)
+    specular    none, one_value
 
-The selection starts with the least of all and tries the next candidate of one part after the other, each from the
-solution before it, until no part gains any more. A candidate is accepted if the mean absolute error on held-out frames,
-paired frame by frame, falls by more than its standard error; where a candidate brings unknowns, also by more than a
-step of the solver that is worth while. Candidates are not all nested (a sun in the sky is no special case of
-harmonics), so that the one beyond a candidate that did not serve is tried, too, and where the selection ends without
-shadows, all parts at once.
+Shadows and bounces are always there: they have no unknowns that could follow the noise, and cost next to nothing. The
+selection starts with the least of all and tries the next candidate of one part after the other, each from the
+solution before it, until no part gains any more. What is judged is the mean absolute error on held-out frames, paired
+frame by frame, with what the prior on skin says against the albedo: where no frame tells light from albedo, shading
+that ends in the albedo would cost nothing. A candidate must let that fall by a share that is worth its unknowns. Where
+the fall lies within its standard error of that share, the frames leave it open, and the fuller model is taken.
+Candidates are not all nested (a sun in the sky is no special case of harmonics), so that the one beyond a candidate
+that did not serve is tried, too.
 
-Reference: [Breiman1984], section 3.4.3 (the one-standard-error rule).
+Reference: [Breiman1984], section 3.4.3 (the standard error of the fall).
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -40,14 +40,11 @@ LIGHTS = {
     "cubemap_32": ("cubemap", 32),
 }
 """Model and resolution of each candidate for the light."""
-VISIBILITIES = ("off", "on", "bounces")
 SPECULARS = ("none", "one_value")
-WORTHWHILE = 0.005
-"""A candidate with more unknowns must lower the error by this share, too: as much as the solver leaves when it
-stops."""
-WORTHWHILE_SPECULAR = 0.02
-"""The same for the first highlights, which cost most: three quarters of a fit's time."""
-PARTS = ("visibility", "specular", "light", "geometry", "roughness")
+WORTHWHILE = {"light": 0.005, "specular": 0.0}
+"""Share by which a candidate must lower the error: one of the light has more unknowns, and the solver leaves as much
+when it stops. Highlights are there on any skin, and what is unknown of them their priors nearly say."""
+PARTS = ("light", "specular")
 """What can be fixed."""
 FEWEST_HELD_OUT = 3
 """Frames, below which differences between them have no standard error."""
@@ -63,21 +60,13 @@ LOOK_AHEAD = 2
 class Model(NamedTuple):
     """A candidate of each part."""
 
-    visibility: str
-    specular: str
     light: str
+    specular: str
 
     def applied(self, settings: AppearanceSettings) -> AppearanceSettings:
         """Settings of this model."""
         light_model, resolution = LIGHTS.get(self.light, (self.light, settings.resolutions[-1]))
-        return replace(
-            settings,
-            light_model=light_model,
-            resolutions=(resolution,),
-            visibility=self.visibility != "off",
-            bounce=self.visibility == "bounces",
-            specular=self.specular != "none",
-        )
+        return replace(settings, light_model=light_model, resolutions=(resolution,), specular=self.specular != "none")
 
 
 def allowed_candidates(
@@ -88,9 +77,7 @@ def allowed_candidates(
     lights = tuple(name for name, (model, resolution) in LIGHTS.items() if model != "cubemap" or resolution <= finest)
     if ("cubemap", finest) not in LIGHTS.values():
         lights += ("cubemap",)  # of the one resolution that the settings name
-    visibility = 1 + settings.visibility + (settings.visibility and settings.bounce)
     candidates = {
-        "visibility": VISIBILITIES[:visibility],
         "light": lights if settings.light_model == "cubemap" else (settings.light_model,),
         "specular": SPECULARS[: 1 + settings.specular],  # last: with highlights a candidate costs ten times as much
     }
@@ -99,12 +86,22 @@ def allowed_candidates(
 
 @dataclass(frozen=True)
 class Trial:
-    """A model's solution on the small capture, its error in each held-out frame [H], and the seconds it took."""
+    """A model's solution on the small capture, its error in each held-out frame [H] as joint_errors has it, and the
+    seconds it took."""
 
     model: Model
     solution: Solution
     errors: np.ndarray
     seconds: float
+
+
+def joint_errors(capture: Capture, solution: Solution, independent: float) -> np.ndarray:
+    """[H] mean absolute errors of the held-out frames, raised by what the prior on skin says against the albedo, as
+    StepReport.judged raises the residual; independent: samples that the clip counts as."""
+    found = next(step for step in reversed(solution.iterations)
+                 if (step["fitted"], step["held_out"]) == (solution.fitted, solution.held_out))
+    against = 2.0 * found["skin_prior"] / ((1.0 - capture.fitted.mean()) * independent)
+    return solution.frame_errors[~capture.fitted] * (1.0 + against) ** 0.5
 
 
 def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
@@ -114,70 +111,55 @@ def gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
     return float(falls.mean()), float(falls.std(ddof=1) / np.sqrt(len(falls)))
 
 
-def serves(before: np.ndarray, after: np.ndarray, worthwhile: float = WORTHWHILE) -> bool:
-    """Whether errors, before [H] and after [H], fell by more than chance, and by more than a share of them.
-    worthwhile: that share."""
+class Decision(Enum):
+    """What held-out frames say of a candidate."""
+
+    SERVES = "serves"
+    OPEN = "open"
+    """They cannot tell: of two models the fuller is taken, since what it has too much costs time alone."""
+    DOES_NOT = "does not serve"
+
+    @property
+    def accepted(self) -> bool:
+        return self is not Decision.DOES_NOT
+
+
+def judge(before: np.ndarray, after: np.ndarray, worthwhile: float) -> Decision:
+    """Whether errors, before [H] and after [H], fell by more than the share worthwhile of them, for certain."""
     fall, standard_error = gain(before, after)
-    return fall > max(standard_error, worthwhile * float(before.mean()))
+    beyond = fall - worthwhile * float(before.mean())
+    if abs(beyond) <= standard_error:
+        return Decision.OPEN
+    return Decision.SERVES if beyond > 0.0 else Decision.DOES_NOT
 
 
 class ModelSelection:
-    """Selects the appearance's parts on small captures of a clip.
+    """Selects light and highlights on a small capture of a clip.
 
-    captures: with visibility (True) and without; report: receives a record of each candidate that was tried.
+    report: receives a record of each candidate that was tried.
     """
 
     def __init__(
         self,
-        captures: Mapping[bool, Capture],
+        capture: Capture,
         settings: AppearanceSettings,
         candidates: Mapping[str, tuple[str, ...]],
         report: Callable[[dict], None] = lambda record: None,
     ):
-        self.captures, self.candidates, self.report = captures, candidates, report
-        self.settings = settings
+        self.capture, self.settings, self.candidates, self.report = capture, settings, candidates, report
         self.tried: set[Model] = set()
         self.present: Trial | None = None
 
     def select(self) -> Trial:
         """The model that no candidate beyond serves better."""
         if self.present is None:
-            self.begin(Model(**{part: names[0] for part, names in self.candidates.items()}))
-            self.report(describe("start", ", ".join(self.present.model), self.present))
-        self._select_parts()
-        shadows_did_not_serve = self.present.model.visibility == "off" and self.candidates["visibility"][-1] != "off"
-        if shadows_did_not_serve and self._leap():
-            self._select_parts()
-        return self.present
-
-    def _select_parts(self) -> None:
+            least = Model(**{part: names[0] for part, names in self.candidates.items()})
+            self.present = self._try(least, None)
+            self.tried.add(least)
+            self.report(describe("start", ", ".join(least), self.present))
         while any([self._select_part(part) for part in self.candidates]):
             pass
-
-    def _leap(self) -> bool:
-        """All parts at once, from a uniform light: shadows that cost nothing and yet do not serve mean that the
-        selection stands where no single part leads out, as under one hard lamp."""
-        lights = self.candidates["light"]
-        model = Model(self.candidates["visibility"][-1], self.candidates["specular"][-1],
-                      next((name for name in lights if name.startswith("cubemap")), lights[-1]))
-        if model in self.tried:
-            return False
-        self.tried.add(model)
-        trial = self._try(model, None)
-        more_specular = model.specular != self.present.model.specular
-        better = serves(self.present.errors, trial.errors, WORTHWHILE_SPECULAR if more_specular else WORTHWHILE)
-        self.report(describe("leap", ", ".join(model), trial, self.present, better))
-        if better:
-            self.present = trial
-        return better
-
-    def begin(self, model: Model, start: Solution | None = None) -> None:
-        """Solves a model to start from, from a solution or from a uniform light."""
-        self.present = self._try(model, start)
-        self.tried.add(model)
-
-    def _capture(self, model: Model) -> Capture:
-        return self.captures[model.visibility != "off"]
+        return self.present
 
     def _select_part(self, part: str) -> bool:
         """Goes up one part as far as it serves."""
@@ -188,21 +170,16 @@ class ModelSelection:
             if (self.present.model.light, names[place]) == ("sun_sky", "harmonics_4"):
                 continue  # which cannot show the sun
             model = self.present.model._replace(**{part: names[place]})
-            # What a finer cubemap did not show of matt skin it does not show of glossy skin either, on the same mesh.
+            # What a finer cubemap did not show of matt skin it does not show of glossy skin either.
             finer = part == "light" and self.present.model.light.startswith("cubemap")
             if model in self.tried or finer and model._replace(specular="none") in self.tried:
                 missed += 1
                 continue
             self.tried.add(model)
             trial = self._try(model, self.present.solution)
-            if part == "visibility" and self._at_bottom():
-                # What fits without shadows can be a long way from what fits with them.
-                trial = min(trial, self._try(model, None), key=lambda trial: trial.errors.mean())
-            # Shadows and bounces bring no unknowns that could follow the noise, and cost next to nothing.
-            worthwhile = {"visibility": 0.0, "specular": WORTHWHILE_SPECULAR}.get(part, WORTHWHILE)
-            better = serves(self.present.errors, trial.errors, worthwhile)
-            self.report(describe(part, names[place], trial, self.present, better))
-            if better:
+            decision = judge(self.present.errors, trial.errors, WORTHWHILE[part])
+            self.report(describe(part, names[place], trial, self.present, decision))
+            if decision.accepted:
                 self.present, selected, missed = trial, True, 0
             else:
                 missed += 1
@@ -212,13 +189,9 @@ class ModelSelection:
         """How many candidates in a row may not serve: a cubemap that a finer one does not improve is fine enough."""
         return 1 if part == "light" and self.present.model.light.startswith("cubemap") else LOOK_AHEAD
 
-    def _at_bottom(self) -> bool:
-        """Whether nothing but the visibility has gained."""
-        return all(getattr(self.present.model, part) == self.candidates[part][0] for part in ("specular", "light"))
-
     def _try(self, model: Model, start: Solution | None) -> Trial:
         begun = time.perf_counter()
-        settings, capture, keeps_start = model.applied(self.settings), self._capture(model), start is not None
+        settings, capture, keeps_start = model.applied(self.settings), self.capture, start is not None
         fine = model.light in FINE_LIGHTS
         if not fine:
             settings = replace(settings, precision=SELECTION_PRECISION)
@@ -238,11 +211,13 @@ class ModelSelection:
             capture, settings, start=start, keep_start=keeps_start, least=FINE_MOVES if fine else MOVES,
             shapes=settings.specular and shapes,
         )
-        errors = solution.frame_errors[~capture.fitted]
+        errors = joint_errors(capture, solution, settings.independent)
         return Trial(model, solution, errors, time.perf_counter() - begun)
 
 
-def describe(part: str, candidate: str, trial: Trial, below: Trial | None = None, selected: bool = True) -> dict:
+def describe(
+    part: str, candidate: str, trial: Trial, below: Trial | None = None, decision: Decision = Decision.SERVES
+) -> dict:
     """A candidate's line of the record; the standard error is that of the fall."""
     fall, standard_error = (None, None) if below is None else gain(below.errors, trial.errors)
     return {
@@ -251,6 +226,7 @@ def describe(part: str, candidate: str, trial: Trial, below: Trial | None = None
         "held_out": float(trial.errors.mean()),
         "fall": fall,
         "standard_error": standard_error,
-        "accepted": selected,
+        "accepted": decision.accepted,
+        "open": decision is Decision.OPEN,
         "seconds": round(trial.seconds, 3),
     }

@@ -1,50 +1,46 @@
-"""Model selection: the rule by which a candidate is accepted, and where it ends on captures whose truth is
-known."""
+"""Model selection: the rule by which a candidate is accepted, and where it ends on captures whose truth is known."""
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from field_check import below, field_faults
-from toy_capture import (
-    NOISE,
-    ROUGHNESS,
-    even_light,
-    glossy_forehead,
-    hard_light,
-    make_truth,
-    under_true_light,
-)
-from toy_head import toy_head
+from toy_capture import NOISE, even_light, hard_light, make_truth
 
-from shared.appearance.fit import Solution
 from shared.appearance.problem import AppearanceSettings
-from shared.compute.run_context import SILENT, RunContext
+from shared.compute.run_context import RunContext
 from shared.contract.job import Parameters
 from shared.contract.records import RUN, SELECTION_TIMES, SOLVE
 from shared.errors import InputError
-from shared.geometry.mesh import segments_at
 from shared.inverse import model_selection
 from shared.inverse.model_selection import select
 from shared.inverse.parameters import read_forced, read_settings
 from shared.inverse.problem import InverseSettings
 from shared.report.content import selection_record
 from shared.report.page import selection_rows
-from shared.selection.candidates import LIGHTS, Model, ModelSelection, Trial, allowed_candidates, gain, serves
-from shared.selection.specular import VARIATIONS, SpecularSelection, SpecularVariation
+from shared.selection.candidates import (
+    LIGHTS,
+    WORTHWHILE,
+    Decision,
+    Model,
+    ModelSelection,
+    Trial,
+    allowed_candidates,
+    gain,
+    joint_errors,
+    judge,
+)
 from shared.shape.gauss_newton import ShapeSettings
 from stages.inverse_render import STAGE
 
 CAREFUL = AppearanceSettings(resolutions=(8, 16), noise=(0.003, 0.01))
 
 
-def selected(capture, settings=CAREFUL, **candidates):
-    """Model selection and the record of its candidates; visibility off would need a transfer of its own."""
+def selected(capture, settings=CAREFUL):
+    """Model selection and the record of its candidates."""
     records = []
-    allowed = allowed_candidates(settings) | {"visibility": ("on", "bounces")} | candidates
-    selection = ModelSelection({True: capture}, settings, allowed, records.append)
+    selection = ModelSelection(capture, settings, allowed_candidates(settings), records.append)
     selection.select()
     return selection, records
 
@@ -82,52 +78,12 @@ def test_every_candidate_is_on_the_record_with_its_error_and_seconds(glossy):
     held_out = records[0]["held_out"]
     for record in records[1:]:
         assert record["fall"] == pytest.approx(held_out - record["held_out"], abs=1e-12)
-        worthwhile = 0.0 if record["part"] == "visibility" else 0.005 * held_out
-        assert record["accepted"] == (record["fall"] > max(record["standard_error"], worthwhile))
+        beyond, uncertain = record["fall"] - WORTHWHILE[record["part"]] * held_out, record["standard_error"]
+        assert record["open"] == (abs(beyond) <= uncertain) and record["accepted"] == (beyond >= -uncertain)
         assert record["seconds"] > 0.0
         held_out = record["held_out"] if record["accepted"] else held_out
     assert held_out == pytest.approx(float(selection.present.errors.mean()))
     assert len(selection.tried) == len(records)  # no model twice
-
-
-def variation_of(capture, segment, **candidates):
-    """The variation of specular terms that is selected under the true light, and the record."""
-    model, records = Model("bounces", "one_value", "cubemap_16"), []
-    settings = model.applied(AppearanceSettings(noise=(0.003, 0.01), roughness=ROUGHNESS))
-    state = under_true_light(capture)[1]
-    trial = Trial(model, Solution(state, (), 0.0, 0.0), np.zeros(0), 0.0)
-    allowed = {"specular": VARIATIONS, "roughness": VARIATIONS} | candidates
-    return SpecularSelection(capture, settings, trial, segment, allowed, records.append).select(), records
-
-
-def test_specular_that_differs_by_segment_is_found_and_used(one_thread):
-    capture = make_truth(roughness_at=glossy_forehead)[0]
-    height = capture.points.positions[:, 1]
-    forehead = (height > np.median(height)).astype(int)
-    variation, records = variation_of(capture, forehead, specular=("one_value",))
-    assert variation.roughness == "by_segment" and variation.specular == "one_value"
-    assert [record["candidate"] for record in records] == ["by_segment", "local"]
-    solution = Solution(under_true_light(capture)[1], (), 0.0, 0.0)
-    worn = variation.worn_by(replace(solution, state=replace(solution.state, roughness=1.1 * ROUGHNESS)))
-    found = worn.local_roughness_fit.roughness(capture.points.positions)
-    assert len(np.unique(found.round(9))) == 2 and worn.local_specular is None
-    assert found[forehead == 1].mean() < 0.93 * 1.1 * ROUGHNESS < 1.05 * 1.1 * ROUGHNESS < found[forehead == 0].mean()
-
-
-def test_one_specular_everywhere_stays_one(one_thread):
-    capture = make_truth()[0]
-    segment = (capture.points.positions[:, 0] > 0.0).astype(int)
-    variation, records = variation_of(capture, segment)
-    assert variation == SpecularVariation() and len(records) == 4
-    assert variation.worn_by(Solution(None, (), 0.0, 0.0)).local_roughness_fit is None
-
-
-def test_points_take_the_segment_of_the_surface_next_to_them():
-    mesh = toy_head(3).mesh(np.zeros(2), np.zeros(1))
-    right = (mesh.vertices[mesh.faces].mean(1)[:, 0] > 0.0).astype(np.uint8)
-    far = np.abs(mesh.vertices[:, 0]) > 30.0
-    assert (segments_at(mesh, right, mesh.vertices[far]) == (mesh.vertices[far, 0] > 0.0)).all()
-    assert segments_at(mesh, None, mesh.vertices) is None
 
 
 def test_a_selection_goes_on_where_it_stands(glossy):
@@ -136,34 +92,13 @@ def test_a_selection_goes_on_where_it_stands(glossy):
     assert selection.select() is before and len(records) == count
 
 
-@pytest.mark.parametrize("alone", [False, True])
-def test_where_shadows_do_not_serve_all_parts_are_tried_at_once(monkeypatch, alone):
-    """alone: shadows serve by themselves, so that there is nothing to leap for."""
-    frames, records = np.random.default_rng(0).uniform(0.9, 1.1, 9), []
-    whole = Model("bounces", "one_value", "cubemap_8")
-
-    def tried(self, model, start):
-        error = 0.5 if model == whole else 0.7 if alone and model.visibility == "bounces" else 1.0
-        return Trial(model, None, error * frames, 0.1)
-
-    monkeypatch.setattr(ModelSelection, "_try", lambda self, model,
-                        start: replace(tried(self, model, start), solution=start))
-    found = ModelSelection({}, CAREFUL, allowed_candidates(CAREFUL), records.append).select()
-    leaps = [record for record in records if record["part"] == "leap"]
-    assert len(leaps) == (not alone) and (alone or found.model == whole)
-    if not alone:
-        assert leaps[0]["candidate"] == "bounces, one_value, cubemap_8" and leaps[0]["accepted"]
-        assert records[-1]["candidate"] == "cubemap_16"  # and the climb goes on from there
-
-
 def tried_candidates(monkeypatch, error_of):
     """What is tried, in order, where a model's error is as given for all frames."""
     records, frames = [], np.linspace(0.99, 1.01, 9)
     monkeypatch.setattr(ModelSelection, "_try", lambda self, model,
                         start: Trial(model, None, error_of(model) * frames, 0.1))
-    monkeypatch.setattr(ModelSelection, "_at_bottom", lambda self: False)
-    ModelSelection({}, CAREFUL, allowed_candidates(CAREFUL), records.append).select()
-    return [(record["candidate"], record["accepted"]) for record in records if record["part"] in ("light", "specular")]
+    ModelSelection(None, CAREFUL, allowed_candidates(CAREFUL), records.append).select()
+    return [(record["candidate"], record["accepted"]) for record in records[1:]]
 
 
 def test_harmonics_are_passed_over_once_a_sun_serves(monkeypatch):
@@ -173,10 +108,10 @@ def test_harmonics_are_passed_over_once_a_sun_serves(monkeypatch):
     assert found[1:3] == [("cubemap_8", False), ("cubemap_16", False)]
 
 
-@pytest.mark.parametrize(("saved", "worth"), [(0.01, False), (0.03, True)])
-def test_highlights_must_save_more_than_other_candidates(monkeypatch, saved, worth):
+@pytest.mark.parametrize("saved", [-0.001, 0.001])
+def test_highlights_need_not_be_worth_more_than_nothing(monkeypatch, saved):
     found = tried_candidates(monkeypatch, lambda model: 1.0 - saved * (model.specular == "one_value"))
-    assert ("one_value", worth) in found
+    assert ("one_value", saved > 0.0) in found
 
 
 def test_the_fall_is_paired_by_frame():
@@ -186,25 +121,40 @@ def test_the_fall_is_paired_by_frame():
     better = frames - 0.001 + 0.0004 * rng.normal(size=12)
     fall, standard_error = gain(frames, better)
     assert fall == pytest.approx(0.001, abs=0.0003) and standard_error < 0.0003 < frames.std()
-    assert serves(frames, better)
-    assert not serves(better, frames)
+    assert judge(frames, better, 0.0) is Decision.SERVES
+    assert judge(better, frames, 0.0) is Decision.DOES_NOT
 
 
-def test_a_fall_within_its_standard_error_does_not_serve():
+def test_what_the_standard_error_leaves_open_takes_the_fuller_model():
     frames = np.full(9, 0.02)
     after = frames - 0.001
     after[0] += 0.012  # one frame loses what the others gain, and more
-    assert gain(frames, after)[0] < gain(frames, after)[1]
-    assert not serves(frames, after)
-    assert not serves(frames, frames - 0.00002)  # all frames gain, but next to nothing
+    assert abs(gain(frames, after)[0]) < gain(frames, after)[1]
+    assert judge(frames, after, 0.005) is judge(after, frames, 0.005) is Decision.OPEN
+    assert Decision.OPEN.accepted and not Decision.DOES_NOT.accepted
+    assert judge(frames, frames - 0.00002, 0.005) is Decision.DOES_NOT  # all frames gain, but next to nothing
+
+
+def test_frames_that_tell_nothing_leave_it_to_the_prior_on_skin(glossy):
+    """As where the camera moves about a still head: shading fits as well as albedo."""
+    selection, _ = glossy
+    capture, solution = selection.capture, selection.present.solution
+
+    def errors_with(skin_prior):
+        last = solution.iterations[-1] | {"skin_prior": skin_prior}
+        changed = replace(solution, iterations=(last,), fitted=last["fitted"], held_out=last["held_out"])
+        return joint_errors(capture, changed, CAREFUL.independent)
+
+    plain, count = solution.frame_errors[~capture.fitted], (~capture.fitted).mean() * CAREFUL.independent
+    assert errors_with(100.0) == pytest.approx(plain * (1.0 + 200.0 / count) ** 0.5)
+    assert judge(errors_with(100.0), errors_with(50.0), WORTHWHILE["specular"]) is Decision.SERVES
+    assert judge(errors_with(50.0), errors_with(100.0), WORTHWHILE["specular"]) is Decision.DOES_NOT
 
 
 def test_settings_bound_model_selection_and_force_its_candidates():
     free = allowed_candidates(AppearanceSettings())
-    assert free["visibility"] == ("off", "on", "bounces") and free["specular"] == ("none", "one_value")
+    assert free["specular"] == ("none", "one_value")
     assert free["light"][0] == "harmonics_2" and free["light"][-1] == "cubemap_16"
-    assert allowed_candidates(AppearanceSettings(bounce=False))["visibility"] == ("off", "on")
-    assert allowed_candidates(AppearanceSettings(visibility=False))["visibility"] == ("off",)
     assert allowed_candidates(AppearanceSettings(specular=False))["specular"] == ("none",)
     assert allowed_candidates(AppearanceSettings(resolutions=(4,)))["light"][-2:] == ("harmonics_4", "cubemap")
     assert allowed_candidates(AppearanceSettings(light_model="sun_sky"))["light"] == ("sun_sky",)
@@ -213,78 +163,46 @@ def test_settings_bound_model_selection_and_force_its_candidates():
 
 
 def test_a_model_becomes_the_solvers_settings():
-    settings = Model("on", "none", "harmonics_4").applied(AppearanceSettings())
+    settings = Model("harmonics_4", "none").applied(AppearanceSettings(bounce=False))
     assert settings.visibility and not settings.bounce and not settings.specular
     assert (settings.light_model, settings.resolutions) == ("harmonics_4", (8,))
-    camera = Model("bounces", "one_value", "camera").applied(AppearanceSettings(light_model="camera"))
-    assert (camera.light_model, camera.resolutions) == ("camera", (16,))
-    coarse = Model("off", "none", "cubemap").applied(AppearanceSettings(resolutions=(4,)))
+    camera = Model("camera", "one_value").applied(AppearanceSettings(light_model="camera"))
+    assert (camera.light_model, camera.resolutions) == ("camera", (16,)) and camera.specular
+    coarse = Model("cubemap", "none").applied(AppearanceSettings(resolutions=(4,)))
     assert (coarse.light_model, coarse.resolutions) == ("cubemap", (4,))
 
 
-class Seen:
-    """A clip's small captures as they are given, in the place of model_selection.SmallClip."""
-
-    def __init__(self, views, surface, settings, chart, context, refined=None):
-        self.surface, self.refined, self.sizes = surface, refined, None
-        self.captures = {visible: surface.capture for visible in (False, True)}
-        self.precomputed = dict.fromkeys(self.captures, SimpleNamespace(nodes=None, directions=None))
-
-
-def noisy(capture, sigma):
-    colours = capture.samples.colours + sigma * np.random.default_rng(1).normal(size=capture.samples.colours.shape)
-    return replace(capture, samples=replace(capture.samples, colours=colours.astype(np.float32)))
+def select_on(monkeypatch, capture, note=lambda text: None):
+    """The model that is chosen on a capture, and the settings that it is chosen from."""
+    monkeypatch.setattr(model_selection, "small_capture", lambda *_: capture)
+    appearance = AppearanceSettings(resolutions=(8,), specular=False, noise=(0.003, 0.01))
+    whole = InverseSettings(appearance=appearance, selection=frozenset(), shape=ShapeSettings(subdivisions=1))
+    return select(None, None, whole, None, RunContext(note=note)), whole
 
 
-MATTE = AppearanceSettings(resolutions=(8,), light_model="harmonics_2", specular=False, noise=(0.003, 0.01))
+def test_only_the_appearance_is_chosen(one_thread, monkeypatch):
+    """Mesh and poses are left to the same steps as under the full model."""
+    notes = []
+    chosen, whole = select_on(monkeypatch, make_truth(specular=0.0, lights=(even_light,))[0], notes.append)
+    assert chosen.settings == replace(whole, appearance=chosen.settings.appearance)
+    assert chosen.settings.appearance.light_model == "harmonics_2" and chosen.start.held_out > 0.0
+    assert len(notes) == len(chosen.candidates) and "not accepted" in notes[-1]
 
 
-def seen_surface(capture, mesh=None):
-    return SimpleNamespace(capture=capture, mesh=mesh, face_segment=np.zeros(1))
-
-
-def select_meshes(monkeypatch, qualities, **settings):
-    """What the clip's model selection leads to if a mesh of each number of subdivisions leaves so much noise."""
-    capture, asked = make_truth(specular=0.0)[0], []
-
-    def refine_shape(views, tracked, *, begun, **named):
-        level = named["settings"].subdivisions
-        asked.append((level, begun))
-        surface = seen_surface(noisy(capture, qualities[1 + level]), f"level {level}")
-        return SimpleNamespace(surface=surface, stopped=3 + level)
-
-    monkeypatch.setattr(model_selection, "SmallClip", Seen)
-    monkeypatch.setattr(model_selection, "refine_shape", refine_shape)
-    monkeypatch.setattr(model_selection, "some_views", lambda *_: None)
-    whole = InverseSettings(appearance=MATTE, selection=frozenset(), shape=ShapeSettings(subdivisions=1), **settings)
-    return select(None, seen_surface(noisy(capture, qualities[0])), whole, None, SILENT), asked
-
-
-def test_the_mesh_is_refined_as_far_as_it_serves(one_thread, monkeypatch):
-    selected, asked = select_meshes(monkeypatch, (0.02, 0.005, 0.02))
-    assert selected.surface.mesh == "level 0" and selected.settings.shape is None
-    assert asked == [(0, None), (1, "level 0")]  # the second goes on where the first ended
-    assert selected.shape_record["refined"] and selected.shape_record["stopped_vertices"] == 3
-    assert selected.shape_record["held_out"]["after"] < 0.5 * selected.shape_record["held_out"]["before"]
-    meshes = [(candidate["candidate"],
-               candidate["accepted"]) for candidate in selected.candidates if candidate["part"] == "geometry"]
-    assert meshes == [("refined", True), ("subdivided_1", False)]
-    assert selected.settings.appearance.specular is False and selected.start.held_out > 0.0
-
-
-def test_a_tracked_mesh_that_no_refinement_improves_stays(one_thread, monkeypatch):
-    selected, asked = select_meshes(monkeypatch, (0.01, 0.01, 0.005))
-    assert selected.surface.mesh is None and selected.shape_record == {"refined": False}
-    assert asked == [(0, None)]
+def test_a_decision_that_stays_open_says_so(one_thread, monkeypatch):
+    notes, frames = [], np.full(9, 0.02)
+    uneven = np.where(np.arange(9) % 2, 0.021, 0.019)
+    monkeypatch.setattr(ModelSelection, "_try", lambda self, model, start: Trial(
+        model, start, frames if model.light == "harmonics_2" else uneven, 0.1))
+    chosen, _ = select_on(monkeypatch, make_truth(specular=0.0)[0], notes.append)
+    assert chosen.candidates[1]["open"] and chosen.candidates[1]["accepted"]
+    assert "accepted, since held-out frames leave it open" in notes[1]
 
 
 def test_too_few_held_out_frames_choose_no_model(one_thread, monkeypatch):
-    capture = make_truth(specular=0.0)[0]
-    monkeypatch.setattr(model_selection, "SmallClip", Seen)
-    notes, whole = [], InverseSettings(appearance=MATTE, selection=frozenset())
-    two = seen_surface(replace(capture, fitted=np.arange(14) > 1))
-    selected = select(None, two, whole, None, RunContext(note=notes.append))
-    assert selected.start is None and selected.candidates == () and selected.settings == replace(whole, selection=None)
+    notes, capture = [], make_truth(specular=0.0)[0]
+    chosen, whole = select_on(monkeypatch, replace(capture, fitted=np.arange(14) > 1), notes.append)
+    assert chosen.start is None and chosen.candidates == () and chosen.settings == replace(whole, selection=None)
     assert "2 frames are too few" in notes[0]
 
 
@@ -296,7 +214,7 @@ def told(**changes):
 def test_the_stage_selects_only_when_told_to():
     assert read_settings(told()).selection is None
     assert read_settings(told(model="auto")).selection == frozenset()
-    assert read_settings(told(model="auto", fixed_parts="light, geometry")).selection == {"light", "geometry"}
+    assert read_settings(told(model="auto", fixed_parts="light, specular")).selection == {"light", "specular"}
 
 
 def test_forcing_what_there_is_not_is_one_clear_line():
