@@ -30,7 +30,7 @@ from shared.inverse.clip_inputs import TrackedPoses
 from shared.inverse.exposure import exposure_warnings, solve_exposure
 from shared.inverse.lamp_distance import describe_lamp, find_lamp
 from shared.inverse.lit_surface import LitSurface, report_to
-from shared.inverse.model_selection import SelectedModel, select
+from shared.inverse.model_selection import select
 from shared.inverse.problem import (
     FACE_SKIN,
     InverseResult,
@@ -72,16 +72,15 @@ def solve_clip(
         surface, outline = meet_outline(some_views(views, settings, contour.frames), surface, contour, context)
         viewer = SurfaceViewer.of(surface.mesh)
     chart, chart_warning = said_by_chart(observations, viewer, views, settings)
-    selected = SelectedModel(settings)
-    if settings.selection is not None:
-        selected = select(views, surface, settings, chart, context)
-    settings = selected.settings
 
-    # Light on the mesh as it was tracked.
+    # Light on the mesh as it was tracked, of the model that is chosen there where one is to be.
     light_views = some_views(views, settings, settings.light_frames)
     lit = LitSurface.of(surface, light_views, settings, chart, context)
-    solution = fit_appearance(lit.coarse, settings.appearance, report_to(context), start=selected.start,
-                              keep_start=selected.start is not None)
+    selected = select(lit, settings, context) if settings.selection is not None else None
+    if selected is None:
+        solution = fit_appearance(lit.coarse, settings.appearance, report_to(context))
+    else:
+        settings, solution = selected.settings, selected.solution
 
     # A lamp that stands near, where held-out frames ask for one.
     by_lamp = find_lamp(lit, solution, light_views, settings, chart, context)
@@ -145,7 +144,7 @@ def solve_clip(
         "warnings": [*filter(None, [chart_warning]), *scale_warnings(chart, typical),
                      *exposure_warnings(exposure), *diagnostic_warnings(diagnostics, views.moves)],
         "albedo_scale": describe_scale(chart, typical, whites, solution.scale),
-        "model_selection": selected.candidates,
+        "model_selection": () if selected is None else selected.candidates,
     }
     maps = make_maps(texels, material, roughness, turn, None if eye_texels is None else eye_texels.rows)
     return InverseResult(solution, material, maps, shading, viewer, views, record, covariance, eyes)

@@ -6,13 +6,14 @@ Each part of the model has candidates of its own, from the least to the most:
     specular    none, one_value
 
 Shadows and bounces are always there: they have no unknowns that could follow the noise, and cost next to nothing. The
-selection starts with the least of all and tries the next candidate of one part after the other, each from the
-solution before it, until no part gains any more. What is judged is the mean absolute error on held-out frames, paired
-frame by frame, with what the prior on skin says against the albedo: where no frame tells light from albedo, shading
-that ends in the albedo would cost nothing. A candidate must let that fall by a share that is worth its unknowns. Where
-the fall lies within its standard error of that share, the frames leave it open, and the fuller model is taken.
-Candidates are not all nested (a sun in the sky is no special case of harmonics), so that the one beyond a candidate
-that did not serve is tried, too.
+selection starts with the least of all and tries the next candidates of the light on matt skin, each from the solution
+before it, then highlights, and with these, which show a lamp that matt skin may not, the light again.
+
+What is judged is the mean absolute error on held-out frames, paired frame by frame, with what the prior on skin says
+against the albedo: where no frame tells light from albedo, shading that ends in the albedo would cost nothing. A
+candidate must let that fall by a share that is worth its unknowns. Where the fall lies within its standard error of
+that share, the frames leave it open, and the fuller model is taken. Candidates are not all nested (a sun in the sky is
+no special case of harmonics), so that the one beyond a candidate that did not serve is tried, too.
 
 Reference: [Breiman1984], section 3.4.3 (the standard error of the fall).
 """
@@ -48,7 +49,7 @@ PARTS = ("light", "specular")
 """What can be fixed."""
 FEWEST_HELD_OUT = 3
 """Frames, below which differences between them have no standard error."""
-SELECTION_STEPS, MOVES = 8, 2
+SELECTION_STEPS, MOVES = 5, 2
 """Most and fewest steps from one candidate to the next: the first one from a light of another model can be worse."""
 SELECTION_PRECISION = (10, 0.03)
 """Of a step of the light while candidates are tried: the chosen model is solved again, with full precision."""
@@ -79,7 +80,7 @@ def allowed_candidates(
         lights += ("cubemap",)  # of the one resolution that the settings name
     candidates = {
         "light": lights if settings.light_model == "cubemap" else (settings.light_model,),
-        "specular": SPECULARS[: 1 + settings.specular],  # last: with highlights a candidate costs ten times as much
+        "specular": SPECULARS[: 1 + settings.specular],
     }
     return {part: names[-1:] if part in forced else names for part, names in candidates.items()}
 
@@ -152,11 +153,9 @@ class ModelSelection:
 
     def select(self) -> Trial:
         """The model that no candidate beyond serves better."""
-        if self.present is None:
-            least = Model(**{part: names[0] for part, names in self.candidates.items()})
-            self.present = self._try(least, None)
-            self.tried.add(least)
-            self.report(describe("start", ", ".join(least), self.present))
+        least = Model(**{part: names[0] for part, names in self.candidates.items()})
+        self.present = self._try(least, None)
+        self.report(describe("start", ", ".join(least), self.present))
         while any([self._select_part(part) for part in self.candidates]):
             pass
         return self.present
@@ -164,21 +163,20 @@ class ModelSelection:
     def _select_part(self, part: str) -> bool:
         """Goes up one part as far as it serves."""
         names, selected, missed = self.candidates[part], False, 0
-        place = names.index(getattr(self.present.model, part))
-        while missed < self._patience(part) and place + 1 < len(names):
-            place += 1
-            if (self.present.model.light, names[place]) == ("sun_sky", "harmonics_4"):
+        for name in names[names.index(getattr(self.present.model, part)) + 1 :]:
+            if missed == self._patience(part):
+                break
+            if (self.present.model.light, name) == ("sun_sky", "harmonics_4"):
                 continue  # which cannot show the sun
-            model = self.present.model._replace(**{part: names[place]})
+            model = self.present.model._replace(**{part: name})
             # What a finer cubemap did not show of matt skin it does not show of glossy skin either.
             finer = part == "light" and self.present.model.light.startswith("cubemap")
             if model in self.tried or finer and model._replace(specular="none") in self.tried:
                 missed += 1
                 continue
-            self.tried.add(model)
             trial = self._try(model, self.present.solution)
             decision = judge(self.present.errors, trial.errors, WORTHWHILE[part])
-            self.report(describe(part, names[place], trial, self.present, decision))
+            self.report(describe(part, name, trial, self.present, decision))
             if decision.accepted:
                 self.present, selected, missed = trial, True, 0
             else:
@@ -191,6 +189,7 @@ class ModelSelection:
 
     def _try(self, model: Model, start: Solution | None) -> Trial:
         begun = time.perf_counter()
+        self.tried.add(model)
         settings, capture, keeps_start = model.applied(self.settings), self.capture, start is not None
         fine = model.light in FINE_LIGHTS
         if not fine:

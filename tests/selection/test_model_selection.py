@@ -14,7 +14,8 @@ from shared.contract.job import Parameters
 from shared.contract.records import RUN, SELECTION_TIMES, SOLVE
 from shared.errors import InputError
 from shared.inverse import model_selection
-from shared.inverse.model_selection import select
+from shared.inverse.lit_surface import LitSurface
+from shared.inverse.model_selection import judged_capture, select
 from shared.inverse.parameters import read_forced, read_settings
 from shared.inverse.problem import InverseSettings
 from shared.report.content import selection_record
@@ -84,12 +85,6 @@ def test_every_candidate_is_on_the_record_with_its_error_and_seconds(glossy):
         held_out = record["held_out"] if record["accepted"] else held_out
     assert held_out == pytest.approx(float(selection.present.errors.mean()))
     assert len(selection.tried) == len(records)  # no model twice
-
-
-def test_a_selection_goes_on_where_it_stands(glossy):
-    selection, records = glossy
-    before, count = selection.present, len(records)
-    assert selection.select() is before and len(records) == count
 
 
 def tried_candidates(monkeypatch, error_of):
@@ -172,21 +167,21 @@ def test_a_model_becomes_the_solvers_settings():
     assert (coarse.light_model, coarse.resolutions) == ("cubemap", (4,))
 
 
-def select_on(monkeypatch, capture, note=lambda text: None):
+def select_on(capture, note=lambda text: None):
     """The model that is chosen on a capture, and the settings that it is chosen from."""
-    monkeypatch.setattr(model_selection, "small_capture", lambda *_: capture)
     appearance = AppearanceSettings(resolutions=(8,), specular=False, noise=(0.003, 0.01))
     whole = InverseSettings(appearance=appearance, selection=frozenset(), shape=ShapeSettings(subdivisions=1))
-    return select(None, None, whole, None, RunContext(note=note)), whole
+    lit = LitSurface(None, None, None, capture, capture.some_points(appearance.coarse_points))
+    return select(lit, whole, RunContext(note=note)), whole
 
 
-def test_only_the_appearance_is_chosen(one_thread, monkeypatch):
+def test_only_the_appearance_is_chosen(one_thread):
     """Mesh and poses are left to the same steps as under the full model."""
     notes = []
-    chosen, whole = select_on(monkeypatch, make_truth(specular=0.0, lights=(even_light,))[0], notes.append)
+    chosen, whole = select_on(make_truth(specular=0.0, lights=(even_light,))[0], notes.append)
     assert chosen.settings == replace(whole, appearance=chosen.settings.appearance)
-    assert chosen.settings.appearance.light_model == "harmonics_2" and chosen.start.held_out > 0.0
-    assert len(notes) == len(chosen.candidates) and "not accepted" in notes[-1]
+    assert chosen.settings.appearance.light_model == "harmonics_2" and 0.0 < chosen.solution.held_out < 1.5 * NOISE
+    assert "not accepted" in notes[len(chosen.candidates) - 1]
 
 
 def test_a_decision_that_stays_open_says_so(one_thread, monkeypatch):
@@ -194,16 +189,27 @@ def test_a_decision_that_stays_open_says_so(one_thread, monkeypatch):
     uneven = np.where(np.arange(9) % 2, 0.021, 0.019)
     monkeypatch.setattr(ModelSelection, "_try", lambda self, model, start: Trial(
         model, start, frames if model.light == "harmonics_2" else uneven, 0.1))
-    chosen, _ = select_on(monkeypatch, make_truth(specular=0.0)[0], notes.append)
+    monkeypatch.setattr(model_selection, "fit_all_points", lambda *_: None)
+    chosen, _ = select_on(make_truth(specular=0.0)[0], notes.append)
     assert chosen.candidates[1]["open"] and chosen.candidates[1]["accepted"]
     assert "accepted, since held-out frames leave it open" in notes[1]
 
 
-def test_too_few_held_out_frames_choose_no_model(one_thread, monkeypatch):
-    notes, capture = [], make_truth(specular=0.0)[0]
-    chosen, whole = select_on(monkeypatch, replace(capture, fitted=np.arange(14) > 1), notes.append)
-    assert chosen.start is None and chosen.candidates == () and chosen.settings == replace(whole, selection=None)
+def test_too_few_held_out_frames_choose_no_model():
+    """Where those that are fitted are few, they are not held out to judge."""
+    capture = make_truth(specular=0.0)[0]
+    notes, few = [], InverseSettings(selection=frozenset(), fit_frames=12)
+    lit = LitSurface(None, None, None, None, replace(capture, fitted=np.arange(14) > 1))
+    assert select(lit, few, RunContext(note=notes.append)) is None
     assert "2 frames are too few" in notes[0]
+
+
+def test_more_frames_judge_than_are_held_out_of_the_solve():
+    capture = make_truth(specular=0.0)[0]
+    judged = judged_capture(capture, InverseSettings())
+    assert len(judged.points) <= 400 and not judged.fitted[~capture.fitted].any()
+    assert (~judged.fitted).sum() > (~capture.fitted).sum()
+    assert (judged_capture(capture, InverseSettings(fit_frames=12)).fitted == capture.fitted).all()
 
 
 def told(**changes):
