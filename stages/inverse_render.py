@@ -294,7 +294,7 @@ def run(job: Job) -> None:
     from shared.inverse.clip_inputs import read_mean_texture
     from shared.inverse.joint_clips import join_clips
     from shared.inverse.parameters import read_settings
-    from shared.inverse.solve import solve_clip, summarise
+    from shared.inverse.solve import in_words, solve_clip, summarise
     from shared.io.arrays import write_json
 
     use_baseline_opencv()
@@ -314,6 +314,7 @@ def run(job: Job) -> None:
     record = summarise(result, views.moves)
     record["warnings"] += [f"clip {clip['name']} lies {clip['match_px']:.1f} px beside the shared mesh: other lens, "
                            "another expression?" for clip in placed if clip.get("match_px", 0.0) > FAR_PX]
+    job.note(f"solved: {in_words(record)}")
     for text in record["warnings"]:
         job.warn(text)
     write_maps(job, result)

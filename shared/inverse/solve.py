@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -230,6 +230,21 @@ def summarise(result: InverseResult, moves: str) -> dict:
         "seen_share_of_texels": round(float(seen.mean()), 4),
         "warnings": warnings_about(result),
     }
+
+
+def in_words(record: Mapping) -> str:
+    """The solved model of a solve.json in one line for people."""
+    model, lamp = record["model"], record.get("lamp", {})
+    roughness = "local" if model["roughness_variation"].get("chosen") == "local" else "one"
+    parts = (
+        f"light of {model['light'].rpartition(' from ')[2]}",
+        f"{roughness} roughness" if model["specular_intensity"] else "no highlights",
+        f"lamp {lamp['distance_mm'] / 1000:.2f} m away" if "distance_mm" in lamp else "",
+        "shape refined" if record.get("shape", {}).get("refined") else "shape as tracked",
+        "poses solved anew on it" if record.get("poses", {}).get("kept") else "",
+        "exposure of each frame" if record.get("exposure") else "",
+    )
+    return ", ".join(filter(None, parts))
 
 
 def warnings_about(result: InverseResult) -> list[str]:

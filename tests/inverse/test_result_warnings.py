@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shared.appearance.projection import reached_end
-from shared.inverse.solve import highlight_warnings, warnings_about
+from shared.inverse.solve import highlight_warnings, in_words, warnings_about
 
 
 def fit_of(roughness=0.4, specular=0.7, highlights_count=True):
@@ -41,3 +41,14 @@ def test_a_parameter_at_the_end_of_its_range(value, end):
 def test_highlights_that_are_not_this_person_s_are_said(fit, said):
     found = highlight_warnings(fit)
     assert len(found) == len(said) and all(word in text for word, text in zip(said, found, strict=True))
+
+
+def test_the_solved_model_is_one_line_for_people():
+    model = {"light": "cubemap of 6 x 16^2 texels from 25 numbers per channel", "specular_intensity": 0.7,
+             "roughness_variation": {"chosen": "one"}}
+    soft = {"model": model, "shape": {"refined": True}, "poses": {"kept": False}}
+    assert in_words(soft) == "light of 25 numbers per channel, one roughness, shape refined"
+    near = soft | {"lamp": {"distance_mm": 750.0}, "poses": {"kept": True}, "exposure": {"brightness": 0.1}}
+    assert in_words(near).endswith("lamp 0.75 m away, shape refined, poses solved anew on it, exposure of each frame")
+    matt = {"model": model | {"specular_intensity": 0.0, "roughness_variation": {}}}
+    assert in_words(matt) == "light of 25 numbers per channel, no highlights, shape as tracked"
