@@ -112,6 +112,21 @@ def read_surface(job: Job, mesh):
     return Surface(mesh, segment, tuple(read_json(job.input("track_landmarks") / "tracking.json")["segments"]))
 
 
+def read_poses(job: Job) -> dict:
+    """inverse_render's poses.npz, and the lids of its frames where they were seen."""
+    import numpy as np
+
+    from shared.io.arrays import load_arrays
+    from shared.tracking.lids import closures
+
+    poses = load_arrays(job.input("inverse_render") / "poses.npz")
+    seen = load_arrays(job.input("track_landmarks") / "landmarks.npz")
+    if "eye_openness" not in seen:
+        return poses
+    place = np.searchsorted(seen["frame_index"], poses["frame_index"])
+    return poses | {"lids": closures(seen["eye_openness"][place])}
+
+
 def find_actions(job: Job, surface) -> tuple[tuple, dict]:
     """The facial actions as blend shapes of the mesh, and what run.json says of them; nothing when switched off."""
     from shared.actions.facial import facial_actions
@@ -178,7 +193,8 @@ def describe_capture(job: Job, poses: dict, frames):
     return UsdCapture(poses["camera_from_head"], poses["frame_index"], fps=frames.fps, intrinsics=intrinsics,
                       width=width,
                       height=height, moves=frames.moves, film_width_mm=film_width,
-                      light_with_camera=light_moves(job, frames.moves) != frames.moves, eye_turn=poses.get("eye_turn"))
+                      light_with_camera=light_moves(job, frames.moves) != frames.moves, eye_turn=poses.get("eye_turn"),
+                      lids=poses.get("lids"))
 
 
 def near_lamp(solve: dict):
@@ -232,7 +248,7 @@ def write_assets(job: Job, asset, eyeballs, poses: dict, maps: dict, envmap) -> 
     from shared.io.usdz import write_head_usdz
 
     write_obj(job.out / "mesh.obj", asset.mesh, eyeballs)
-    kept = ("camera_from_head", "frame_index", "intrinsics", "gaze", "eye_turn", "gain")
+    kept = ("camera_from_head", "frame_index", "intrinsics", "gaze", "eye_turn", "lids", "gain")
     save_arrays(job.out / "poses.npz", **{name: poses[name] for name in kept if name in poses})
     write_head_usda(job.out, asset)
     finest = job.params.viewer_detail
@@ -249,8 +265,9 @@ def light_moves(job: Job, moves: str) -> str:
     return "head" if job.manifest("inverse_render")["parameters"].get("light_model") == "camera" else moves
 
 
-def render_views(job: Job, writer, mesh, eyes, maps: dict, envmap, poses: dict, frames, solve: dict):
+def render_views(job: Job, writer, mesh, eyes, actions, maps: dict, envmap, poses: dict, frames, solve: dict):
     """Writes views/novel_*.exr, views/relit_*.exr and the lights -> the ViewSet; None when switched off."""
+    from shared.geometry.blend_shapes import blinks_of
     from shared.imaging.turning_eyes import TurningEyes
     from shared.rendering.near_lamp import NearLamp
     from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
@@ -262,7 +279,7 @@ def render_views(job: Job, writer, mesh, eyes, maps: dict, envmap, poses: dict, 
     views = make_views(
         mesh, maps, envmap, camera_from_head=poses["camera_from_head"], moves=moves, pixels=job.params.view_size,
         held_out=cameras, progress=job.progress, lamp=NearLamp.of_record(solve.get("lamp") or {}),
-        eyes=TurningEyes(mesh, eyes) if eyes else None,
+        eyes=TurningEyes(mesh, eyes) if eyes else None, blinks=blinks_of(actions),
     )
     (job.out / "views").mkdir()
     pictures = {f"novel_{name}": picture for name, picture in views.novel.items()}
@@ -365,7 +382,7 @@ def run(job: Job) -> None:
     from shared.geometry.eyeballs import eyeballs_of
     from shared.geometry.mesh import shading_normals
     from shared.geometry.reduction import reduced
-    from shared.io.arrays import load_arrays, read_json, write_json
+    from shared.io.arrays import read_json, write_json
     from shared.io.export_maps import MapWriter
     from shared.io.frames import FrameSet
     from shared.io.images import read_exr
@@ -378,7 +395,7 @@ def run(job: Job) -> None:
     use_baseline_opencv()
     start, solved = time.perf_counter(), job.input("inverse_render")
     frames = FrameSet.open(job.input("sample_frames"))
-    mesh, poses = load_mesh(solved / "mesh.npz"), load_arrays(solved / "poses.npz")
+    mesh, poses = load_mesh(solved / "mesh.npz"), read_poses(job)
     solve, maps, envmap = read_json(solved / "solve.json"), read_maps(solved / "maps"), read_exr(solved / "envmap.exr")
     source = {"stage": STAGE.name, "stage_version": STAGE.version, "source": "inverse_render"}
     params = job.params
@@ -400,7 +417,7 @@ def run(job: Job) -> None:
     asset = describe_asset(job, mesh, eyes, actions, details, base, describe_capture(job, poses, frames), frames,
                            writer, lamp)
     write_assets(job, asset, eyeballs, poses, maps, far)
-    views = render_views(job, writer, mesh, eyes, maps, envmap, poses, frames, solve)
+    views = render_views(job, writer, mesh, eyes, actions, maps, envmap, poses, frames, solve)
     record = run_record(job, mesh, said_of_them, solve, time.perf_counter() - start)
     write_json(job.out / "run.json", record)
     methods = method_records(job, record, solve)

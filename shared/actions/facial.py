@@ -8,6 +8,7 @@ of their own.
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import replace
 
 import numpy as np
@@ -17,8 +18,7 @@ from shared.actions.folds import SkinFolds
 from shared.actions.lips import LipContact
 from shared.actions.names import named_actions
 from shared.actions.transfer import carried, local_similarities
-from shared.geometry.blend_shapes import BlendShape
-from shared.geometry.eyeballs import SIDES
+from shared.geometry.blend_shapes import BLINKS, BlendShape
 from shared.tracking.head_model import HeadModel
 
 LEAST_MM = 0.05
@@ -28,8 +28,6 @@ HIDDEN = ("eyes", "eye_sockets", "inner_mouth")
 TOUCHING = ("lids", "eyes", "eye_sockets", "lips", "inner_mouth")
 """Segments in which skin touches skin, or an eyeball. The rims of a fitted head's lids, deeper than real ones, reach
 into the ball at rest."""
-BLINKS = tuple(f"eyeBlink{side.capitalize()}" for side in SIDES)
-"""Of the right and the left eye."""
 
 
 def levels_of(model: HeadModel, faces: np.ndarray) -> list[HeadModel]:
@@ -43,10 +41,12 @@ def levels_of(model: HeadModel, faces: np.ndarray) -> list[HeadModel]:
     return levels[1:] if np.array_equal(levels[-1].faces, faces) else []
 
 
-def facial_actions(model: HeadModel, vertices: np.ndarray, faces: np.ndarray) -> tuple[BlendShape, ...]:
+def facial_actions(
+    model: HeadModel, vertices: np.ndarray, faces: np.ndarray, only: Container[str] | None = None
+) -> tuple[BlendShape, ...]:
     """Of the head with vertices [V, 3] mm and faces [F, 3]; none where these are not the model's, subdivided.
 
-    model: the head model at its coarsest level.
+    model: the head model at its coarsest level; only: names of those that are wanted, None: all.
     """
     levels = levels_of(model, faces)
     if not levels:
@@ -57,6 +57,8 @@ def facial_actions(model: HeadModel, vertices: np.ndarray, faces: np.ndarray) ->
     still, skin = surface.vertices_of(("eyes",)), SkinFolds.of(vertices, faces, ~surface.vertices_of(TOUCHING))
     shapes = []
     for name, moves in named_actions(finer).items():
+        if only is not None and name not in only:
+            continue
         moved, between = np.where(still[:, None], 0.0, carried(moves, maps)), ()
         if lids is not None and name in BLINKS:
             moved, half = lids.blink(BLINKS.index(name), moves, moved)

@@ -17,6 +17,9 @@ GAZE = Field("gaze", "Where the right and the left eye look: yaw to +x, pitch to
 EYE_TURN = Field("eye_turn", "The same with which the mesh's eyeballs, turned about their own centres, show the irises "
                  "where the clip does: a fitted head's are some millimetres off.", "float64", "F, 2, 2", "rad",
                  optional=True)
+LIDS = Field("lids", "How far the right and the left eye are shut: 0 as the mesh has them, 1 shut; weights of "
+             "`eyeBlinkRight` and `eyeBlinkLeft`. Absent where the lids were not seen.", "float64", "F, 2",
+             optional=True)
 GAIN = Field("gain", "By how much the frame's red, green and blue are brighter than the still light makes them: "
              "exposure and white balance. Absent where they stay.", "float64", "F, 3", optional=True)
 SOURCE_LENS = Field("intrinsics", "The camera matrix of the full source frame.", "float64", "3, 3", "px")
@@ -372,7 +375,7 @@ SOLVE = (
 
 SELECTION_TIMES = (Field("[]", "Seconds of each entry of `model_selection` in solve.json, in order.", unit="s"),)
 
-EXPORTED_POSES = (POSES, FRAME_INDEX, SOURCE_LENS, GAZE, EYE_TURN, GAIN)
+EXPORTED_POSES = (POSES, FRAME_INDEX, SOURCE_LENS, GAZE, EYE_TURN, LIDS, GAIN)
 _STAGE_RECORD = (
     Field("version", "The stage's version.", "int"),
     Field("parameters.**", "Its parameters as used.", ""),

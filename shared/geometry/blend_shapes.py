@@ -9,6 +9,9 @@ import numpy as np
 
 from shared.geometry.mesh import Mesh, shading_normals, vertex_normals
 
+BLINKS = "eyeBlinkRight", "eyeBlinkLeft"
+"""Names of the actions that shut the right and the left eye."""
+
 
 @dataclass(frozen=True, eq=False)
 class BlendShape:
@@ -75,3 +78,18 @@ def with_normals(shapes: Sequence[BlendShape], mesh: Mesh) -> tuple[BlendShape, 
             added.append(np.where(np.abs(after).max(1, keepdims=True) > 0.0, after - before, 0.0))
         found.append(replace(shape, normals=np.array(added, np.float32)))
     return tuple(found)
+
+
+def blink_weights(names: Sequence[str], lids: np.ndarray) -> np.ndarray:
+    """[F, len(names)] weights of actions, 0 but for the blinks, which shut each eye as far as lids [F, 2] say."""
+    weights = np.zeros((len(lids), len(names)))
+    for eye, name in enumerate(BLINKS):
+        if name in names:
+            weights[:, list(names).index(name)] = lids[:, eye]
+    return weights
+
+
+def blinks_of(shapes: Sequence[BlendShape]) -> tuple[BlendShape, ...]:
+    """Those that shut the right and the left eye; none where one of them is missing."""
+    named = {shape.name: shape for shape in shapes}
+    return tuple(named[name] for name in BLINKS) if named.keys() >= set(BLINKS) else ()

@@ -9,7 +9,8 @@ rotation, and without the animation they look straight ahead.
 
 Facial actions are morph targets of places and normals, sparse, named in the mesh's extras as exporters agreed on. glTF
 goes straight from 0 to 1: an in-between is a target of its own after all others, the difference from that straight way.
-`eyeBlinkLeft_50` belongs to `eyeBlinkLeft`: with weight 1 - |2 w - 1| where that one has w.
+`eyeBlinkLeft_50` belongs to `eyeBlinkLeft`: with weight 1 - |2 w - 1| where that one has w. The animation has the
+clip's blinks.
 
 References: glTF 2.0 specification (GLB container, accessors, animations); KHR_materials_specular (F0 = min(0.04 *
 specularColor, 1) * specular); KHR_materials_ior.
@@ -25,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from shared.geometry.blend_shapes import BlendShape
+from shared.geometry.blend_shapes import BLINKS, BlendShape, blink_weights
 from shared.geometry.eyeballs import EYE_ROUGHNESS, TEAR_FILM_IOR
 from shared.geometry.mesh import tangent_frames, unique_pairs, uv_tangents
 from shared.geometry.parts import HEAD, RigidPart
@@ -141,7 +142,7 @@ def write_glb(
                 "znear": 0.01,
             },
         }],
-        "animations": [_animation(buffer, capture, len(turning))],
+        "animations": [_animation(buffer, capture, len(turning), [target.name for target in targets])],
     }
     content |= {
         "accessors": buffer.accessors,
@@ -243,9 +244,9 @@ def _material(buffer: _Buffer, maps: Mapping[str, np.ndarray]) -> tuple[list[int
     return [buffer.add(texture_png(picture)) for picture in pictures], material
 
 
-def _animation(buffer: _Buffer, capture: UsdCapture, eye_count: int) -> dict:
-    """The motion of what moved, head (node 0) or camera (node 1), from 0 s at the first frame; and how the eyes
-    turn."""
+def _animation(buffer: _Buffer, capture: UsdCapture, eye_count: int, targets: Sequence[str]) -> dict:
+    """The motion of what moved, head (node 0) or camera (node 1), from 0 s at the first frame; how the eyes turn; and
+    the weights of the head's morph targets, where the clip blinks."""
     node = 1 if capture.moves == "camera" else 0
     world_from_local = world_from_usd_camera(capture) if node else world_from_head_rigid(capture)
     time = buffer.array(_seconds(capture, capture.frame_index), bounds=True)
@@ -258,12 +259,23 @@ def _animation(buffer: _Buffer, capture: UsdCapture, eye_count: int) -> dict:
         if len(frames):
             open_eyes = buffer.array(_seconds(capture, frames), bounds=True)
             tracks.append((_FIRST_EYE + k, "rotation", open_eyes, buffer.array(_quaternions(rotations))))
+    if targets and capture.lids is not None and capture.lids.any():
+        tracks.append((0, "weights", time, buffer.array(_target_weights(targets, capture.lids).ravel())))
     return {
         "name": "clip",
         "samplers": [{"input": times, "output": values, "interpolation": "LINEAR"} for _, _, times, values in tracks],
         "channels": [{"sampler": k, "target": {"node": moved, "path": kind}}
                      for k, (moved, kind, _, _) in enumerate(tracks)],
     }
+
+
+def _target_weights(targets: Sequence[str], lids: np.ndarray) -> np.ndarray:
+    """[F, len(targets)]: the blinks' own and those of their in-betweens; lids [F, 2] as in UsdCapture."""
+    weights = blink_weights(targets, lids)
+    for name in BLINKS:
+        if f"{name}_50" in targets:
+            weights[:, targets.index(f"{name}_50")] = 1.0 - np.abs(2.0 * weights[:, targets.index(name)] - 1.0)
+    return weights
 
 
 def _seconds(capture: UsdCapture, frames: np.ndarray) -> np.ndarray:

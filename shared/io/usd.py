@@ -43,7 +43,7 @@ from shared.geometry.parts import EYES, HEAD, RigidPart, head_parts, quad_part
 from shared.geometry.quads import QuadMesh
 from shared.geometry.reduction import ReducedMesh
 from shared.imaging.displacement import DisplacedBase
-from shared.io.usd_actions import bind_actions, define_skeleton
+from shared.io.usd_actions import bind_actions, define_skeleton, set_weights
 from shared.io.usd_capture import (
     BallLamp,
     Plate,
@@ -274,11 +274,13 @@ def _define_variants(stage: Usd.Stage, root: Usd.Prim, asset: HeadAsset) -> None
     with in_variant(root, VARIANT_SET, VARIANT_STILL, VARIANT_CLIP):
         _set_extents(root, vertices[None])
         _define_gaze(root, asset, moves=False)
+        _define_weights(root, asset, moves=False)
     with in_variant(root, VARIANT_SET, VARIANT_CLIP, VARIANT_CLIP):
         moved = world_from_head_rigid(asset.capture)
         box = np.array(np.meshgrid(*np.stack([vertices.min(0), vertices.max(0)]).T)).reshape(3, -1).T
         _set_extents(root, np.einsum("fij,nj->fni", moved[:, :3, :3], box) + moved[:, None, :3, 3])
         _define_gaze(root, asset, moves=True)
+        _define_weights(root, asset, moves=True)
         _define_capture(stage, root, asset)
 
 
@@ -290,6 +292,12 @@ def _define_gaze(root: Usd.Prim, asset: HeadAsset, moves: bool) -> None:
         if moves:
             frames, rotations = eye_turns(asset.capture, k)
             turn(orient, rotations, frames)
+
+
+def _define_weights(root: Usd.Prim, asset: HeadAsset, moves: bool) -> None:
+    """The actions at rest; moves: with the clip's blinks as time samples."""
+    if asset.actions:
+        set_weights(root.GetPrimAtPath("geo"), asset.actions, asset.capture if moves else None)
 
 
 def _set_extents(root: Usd.Prim, points: np.ndarray) -> None:

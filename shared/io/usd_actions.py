@@ -4,10 +4,10 @@
       head              Mesh with SkelBindingAPI, the names of its actions and where they are
         <action>        BlendShape: offsets of the points that move and of their normals, in-betweens
       skeleton          Skeleton, as UsdSkel wants one; its only joint, the head itself, moves nothing
-        actions         SkelAnimation with the weight of each action, all 0: the head at rest
+        actions         SkelAnimation with the weight of each action, 0: the head at rest
 
-Whoever animates the face sets `blendShapeWeights` of `actions`, or writes a SkelAnimation of their own and binds that
-one to the skeleton.
+The clip's blinks are time samples of these weights. Whoever animates the face sets `blendShapeWeights` of `actions`, or
+writes a SkelAnimation of their own and binds that one to the skeleton.
 
 Reference: UsdSkel, Schemas (Blend Shapes).
 """
@@ -19,14 +19,16 @@ from collections.abc import Sequence
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from shared.geometry.blend_shapes import BlendShape
+from shared.geometry.blend_shapes import BlendShape, blink_weights
+from shared.io.usd_capture import UsdCapture
 
 SKELETON, ANIMATION, JOINT = "skeleton", "actions", "head"
 HALF_WEIGHT, HALF_NAME = 0.5, "half"
 
 
 def define_skeleton(stage: Usd.Stage, root: Sdf.Path, shapes: Sequence[BlendShape]) -> Sdf.Path:
-    """The skeleton below the SkelRoot at root, and the weights of the shapes -> its path."""
+    """The skeleton below the SkelRoot at root, and what animates the shapes -> its path. Their weights are
+    set_weights'."""
     path, names = root.AppendChild(SKELETON), [shape.name for shape in shapes]
     skeleton = UsdSkel.Skeleton.Define(stage, path)
     rest = Vt.Matrix4dArray([Gf.Matrix4d(1.0)])
@@ -35,9 +37,20 @@ def define_skeleton(stage: Usd.Stage, root: Sdf.Path, shapes: Sequence[BlendShap
     skeleton.CreateRestTransformsAttr(rest)
     animation = UsdSkel.Animation.Define(stage, path.AppendChild(ANIMATION))
     animation.CreateBlendShapesAttr(names)
-    animation.CreateBlendShapeWeightsAttr(Vt.FloatArray(len(names), 0.0))
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
     return path
+
+
+def set_weights(root: Usd.Prim, shapes: Sequence[BlendShape], capture: UsdCapture | None) -> None:
+    """The head at rest; capture: whose blinks become time samples, None: no one's. root: the SkelRoot."""
+    path = root.GetPath().AppendPath(f"{SKELETON}/{ANIMATION}")
+    weights = UsdSkel.Animation(root.GetStage().GetPrimAtPath(path)).GetBlendShapeWeightsAttr()
+    weights.Set(Vt.FloatArray(len(shapes), 0.0))
+    if capture is None or capture.lids is None or not capture.lids.any():
+        return
+    blinks = blink_weights([shape.name for shape in shapes], capture.lids).astype(np.float32)
+    for time, row in zip(capture.frame_index, blinks, strict=True):
+        weights.Set(Vt.FloatArray.FromNumpy(row), float(time))
 
 
 def bind_actions(mesh: UsdGeom.Mesh, skeleton: Sdf.Path, shapes: Sequence[BlendShape]) -> None:

@@ -42,7 +42,7 @@ class UsdCapture:
     moves: "head" or "camera", what turned while the light stood still. film_width_mm: width of the sensor
     that the full frame shows. light_with_camera: the camera moved and carried the light along. eye_turn [F, 2, 2]
     radians: how the right and the left eyeball are turned (shared/geometry/eyeballs.py), NaN while shut; None where it
-    is not known.
+    is not known. lids [F, 2] in [0, 1]: how far the right and the left eye are shut, None where that is not known.
     """
 
     camera_from_head: np.ndarray
@@ -55,6 +55,7 @@ class UsdCapture:
     film_width_mm: float = DEFAULT_FILM_WIDTH_MM
     light_with_camera: bool = False
     eye_turn: np.ndarray | None = None
+    lids: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,15 @@ ROUGHNESSES = (0.1, 0.3, 0.5, 0.8)
 @dataclass(frozen=True)
 class ViewCamera:
     """camera_from_head [4, 4] mm, intrinsics [3, 3] px of a picture of size (width, height); gaze [2, 2] radians: how
-    the eyeballs are turned in the head that it looks at, None: straight ahead; gain [3]: of its exposure, None: 1."""
+    the eyeballs are turned in the head that it looks at, None: straight ahead; lids [2]: how far its right and left eye
+    are shut, None: as the mesh has them; gain [3]: of its exposure, None: 1."""
 
     camera_from_head: np.ndarray
     intrinsics: np.ndarray
     size: tuple[int, int]
     gaze: np.ndarray | None = None
     gain: np.ndarray | None = None
+    lids: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shared.compute.threads import share_out
+from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.mesh import Mesh, interpolate, normalised
 from shared.geometry.raycast import RAY_START_MM, camera_hits
 from shared.geometry.transforms import camera_centres, rigid, world_from_head
@@ -53,15 +54,16 @@ def make_views(
     progress: Callable | None = None,
     lamp: NearLamp | None = None,
     eyes: TurningEyes | None = None,
+    blinks: Sequence[BlendShape] = (),
 ) -> ViewSet:
     """All of them, pixels wide. maps and progress as for HeadViews; envmap [H, 2 H, 3], camera_from_head [F, 4, 4] and
     moves of the clip; held_out: frames of the clip to re-render, with their cameras; lamp: of its light, where it
     stands near: for those frames, while from elsewhere the head is seen under the light as its mean place has it;
-    eyes: those of the mesh, which turn with the cameras' gaze."""
+    eyes: those of the mesh, which turn with the cameras' gaze; blinks: see HeadViews."""
     around = [orbit_camera(mesh, *place, pixels) for place in NOVEL_VIEWS.values()]
     camera, front = orbit_camera(mesh, RELIT_YAW_DEG, 0.0, pixels), orbit_camera(mesh, 0.0, 0.0, pixels)
     cameras = [*around, camera, front, *held_out.values()]
-    views = HeadViews(mesh, maps, VIEW_SIZES, cameras, progress, eyes=eyes)
+    views = HeadViews(mesh, maps, VIEW_SIZES, cameras, progress, eyes=eyes, blinks=blinks)
     novel = views.render(clip_light(envmap, camera_from_head, moves), around)
     again = views.render(envmap, list(held_out.values()), moves, fade=False, lamp=lamp) if held_out else []
     covered = share_out(len(ROUGHNESSES), lambda k: views.visibility(front, ROUGHNESSES[k]))
@@ -105,10 +107,10 @@ def held_out_cameras(
 
 
 def clip_camera(poses: Mapping[str, np.ndarray], f: int, lens: np.ndarray, size: tuple[int, int]) -> ViewCamera:
-    """Camera f of a poses.npz with a lens [3, 3] and a picture's size (width, height), px, with gaze and gain if it has
-    them."""
-    gaze, gain = (poses[name][f] if name in poses else None for name in ("eye_turn", "gain"))
-    return ViewCamera(poses["camera_from_head"][f], lens, size, gaze, gain)
+    """Camera f of a poses.npz with a lens [3, 3] and a picture's size (width, height), px, with gaze, gain and lids if
+    it has them."""
+    gaze, gain, lids = (poses[name][f] if name in poses else None for name in ("eye_turn", "gain", "lids"))
+    return ViewCamera(poses["camera_from_head"][f], lens, size, gaze, gain, lids)
 
 
 def frontal_frame(camera_from_head: np.ndarray) -> int:
@@ -128,7 +130,9 @@ class HeadViews:
     maps: diffuse_albedo [S, S, 3], specular_intensity [S, S], roughness [S, S]. cameras: all that will look at it, so
     that only what they can see is traced; none: everything; only [V]: vertices that matter, all by default.
     progress(items, label) wraps the trace. light_resolution: edge of the cubemap that lights are seen through; deep:
-    see VertexShading; over 1 where cavities are exact; eyes: those of the mesh, None: they do not turn.
+    see VertexShading; over 1 where cavities are exact; eyes: those of the mesh, None: they do not turn; blinks: of the
+    right and the left eye, blend shapes of the mesh, with which lids move as cameras say, none: they do not. Light on
+    them stays what it is on open ones.
     """
 
     def __init__(
@@ -142,8 +146,9 @@ class HeadViews:
         deep: float = DEEP,
         only: np.ndarray | None = None,
         eyes: TurningEyes | None = None,
+        blinks: Sequence[BlendShape] = (),
     ):
-        self.light_resolution, self.deep, self.eyes = light_resolution, deep, eyes
+        self.light_resolution, self.deep, self.eyes, self.blinks = light_resolution, deep, eyes, blinks
         self.viewer = SurfaceViewer.of(mesh)
         self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"])
         self.precomputed = precompute_transfer(self.viewer, sizes or Sizes())
@@ -214,12 +219,21 @@ class HeadViews:
         pictures = []
         for k, camera in enumerate(cameras):
             picture, covered = render_frame(
-                self.viewer, shading, self.maps, k, camera.camera_from_head, camera.intrinsics, camera.size,
+                self._blinking(camera), shading, self.maps, k, camera.camera_from_head, camera.intrinsics, camera.size,
                 eyes=self._looking(camera),
             )
             picture = picture if camera.gain is None else picture * camera.gain
             pictures.append(picture * covered[..., None] if fade else picture)
         return pictures
+
+    def _blinking(self, camera: ViewCamera) -> SurfaceViewer:
+        """The head with its lids as they are before a camera."""
+        if not self.blinks or camera.lids is None or not np.any(camera.lids):
+            return self.viewer
+        vertices = self.viewer.mesh.vertices
+        for blink, shut in zip(self.blinks, camera.lids, strict=True):
+            vertices = blink.applied(vertices, shut)
+        return SurfaceViewer.of(self.viewer.mesh.replace(vertices=vertices))
 
     def _looking(self, camera: ViewCamera) -> LookingEyes | None:
         gaze = np.full((2, 2), np.nan) if camera.gaze is None else camera.gaze

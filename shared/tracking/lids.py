@@ -27,6 +27,8 @@ OTHER_EYE = 1.0 / 3.0
 """Lids move together: share that the other eye has in what is said of one."""
 UPPER, LOWER, CORNERS = slice(10, 15), slice(2, 7), (0, 8)
 """Of the lids' sixteen points: the middle of both margins, and the outer and inner corner."""
+SLACK = 0.15
+"""Of the way from open to shut: apertures of open eyes wander by that with the pose and the network's noise."""
 ROUNDS, NOT_OPEN = 8, 0.8
 BIAS_PRIOR, LEAST_LEVEL = 0.3, 0.75
 """Ridge on what of the aperture may follow the pose, a share of the evidence, and the least that it may leave of it: a
@@ -65,6 +67,17 @@ def from_shut(openness: np.ndarray) -> np.ndarray:
     lowest = np.min(openness, axis=0, initial=1.0, where=np.isfinite(openness))
     reads = np.where(lowest > SHUT_READS[1], SHUT_READS[0], np.maximum(lowest, SHUT_READS[0]))
     return (openness - reads) / (1.0 - reads)
+
+
+def closures(openness: np.ndarray) -> np.ndarray:
+    """openness [F, 2] of lids -> how far each eye is shut, [F, 2]: 0 as open eyes are, 1 shut. Where an eye is not seen
+    its lids do as the other one's, where neither is, as in the frames before and after."""
+    shut = (1.0 - from_shut(openness) - SLACK) / (1.0 - SLACK)
+    shut = np.clip(np.where(np.isfinite(shut), shut, shut[:, ::-1]), 0.0, 1.0)
+    known = np.nonzero(np.isfinite(shut).all(1))[0]
+    if not len(known):
+        return np.zeros_like(shut)
+    return np.stack([np.interp(np.arange(len(shut)), known, own[known]) for own in shut.T], axis=1)
 
 
 def _together(values: np.ndarray) -> np.ndarray:

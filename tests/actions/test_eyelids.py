@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from shared.actions.eyelids import CLEAR_MM
-from shared.actions.facial import BLINKS, facial_actions
+from shared.actions.facial import facial_actions
+from shared.geometry.blend_shapes import BLINKS
 from shared.geometry.eyeballs import eyeballs_of
 from shared.geometry.raycast import RayScene
 from shared.tracking.fit_lids import LidMargins

@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from toy_result import toy_eyed_surface
 
-from shared.actions.facial import BLINKS, LEAST_MM, TOUCHING, facial_actions, levels_of
+from shared.actions.facial import LEAST_MM, TOUCHING, facial_actions, levels_of
 from shared.actions.names import named_actions
-from shared.geometry.blend_shapes import BlendShape
+from shared.geometry.blend_shapes import BLINKS, BlendShape
 from shared.geometry.intersections import crossing_edges, edges_beside
 from shared.geometry.surface import Surface
 from shared.tracking.head_model import HeadModel

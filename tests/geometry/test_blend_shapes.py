@@ -3,7 +3,7 @@
 import numpy as np
 from toy_result import toy_mesh
 
-from shared.geometry.blend_shapes import BlendShape, with_normals
+from shared.geometry.blend_shapes import BLINKS, BlendShape, blink_weights, blinks_of, with_normals
 from shared.geometry.mesh import Mesh, shading_normals
 
 MOVES = np.array([[0.0, 0, 0], [4.0, 0, 0], [0.0, 2, 0], [0.004, 0, 0], [0.0, 0, 1]])
@@ -70,3 +70,12 @@ def test_normals_added_are_those_of_the_moved_mesh():
     flat = Mesh(np.eye(3), np.array([[0, 1, 2]]), np.eye(3)[:, :2], np.array([[0, 1, 2]]))
     (squeezed,) = with_normals([BlendShape.of("blink", -flat.vertices, 0.0)], flat)
     assert not squeezed.normals.any()
+
+
+def test_blinks_are_found_by_name_and_weighed_by_the_lids():
+    shapes = [BlendShape.of(name, np.eye(3), 0.0) for name in ("jawOpen", "eyeBlinkLeft", "eyeBlinkRight")]
+    assert [shape.name for shape in blinks_of(shapes)] == list(BLINKS)
+    assert blinks_of(shapes[:2]) == ()
+    lids = np.array([[0.0, 0.0], [0.25, 1.0]])  # right, left
+    np.testing.assert_array_equal(blink_weights([shape.name for shape in shapes], lids), [[0, 0, 0], [0, 1.0, 0.25]])
+    np.testing.assert_array_equal(blink_weights(["jawOpen"], lids), np.zeros((2, 1)))

@@ -97,6 +97,8 @@ def write_toy_work(work: Path, moves: str = "head", eyes: bool = False) -> Path:
     excluded = [{"frame_index": 4, "reason": "landmarks absent"}]
     tracking = {"excluded": excluded, "warnings": [], "segments": SEGMENTS}
     write_json(work / "track_landmarks" / "tracking.json", tracking)
+    openness = {"eye_openness": np.where(np.isfinite(toy_gaze()).all(2), 1.0, 0.1)} if eyes else {}
+    save_arrays(work / "track_landmarks" / "landmarks.npz", frame_index=FRAMES, **openness)
     write_png(work / "track_landmarks" / "overlay.png", np.full((40, 120, 3), 90, np.uint8))
     write_png(work / "sample_frames" / "chart.png", np.full((40, 60, 3), 120, np.uint8))
     _write_solution(work / "inverse_render")

@@ -28,6 +28,7 @@ from shared.geometry.mesh import uv_tangents, vertex_normals
 from shared.geometry.parts import head_parts
 from shared.imaging.color import encode_srgb
 from shared.io.gltf import write_glb
+from shared.io.gltf_validate import glb_errors
 from shared.io.usd_capture import UsdCapture, world_from_head_rigid, world_from_usd_camera
 
 NAME = '1st "Zoë" <take> / été'
@@ -288,3 +289,22 @@ def test_names_and_bytes(file, tmp_path, moves):
     assert chunks(file)[0]["scenes"][0]["name"] == NAME
     write_glb(tmp_path / "again.glb", NAME, head_parts(toy_mesh()), toy_maps(), capture(moves))
     assert (tmp_path / "again.glb").read_bytes() == file.read_bytes()
+
+
+def test_the_animation_blinks(tmp_path):
+    """Blend weights of each frame; the in-between has all of its own where the eye is half shut."""
+    mesh, lids = toy_mesh(), np.linspace(0.0, 1.0, 2 * len(FRAMES)).reshape(-1, 2)
+    blinking = replace(capture("head"), lids=lids)
+    actions = with_normals(toy_actions(len(mesh.vertices)), mesh)
+    write_glb(tmp_path / "a.glb", NAME, head_parts(mesh), toy_maps(), blinking, actions)
+    write_glb(tmp_path / "b.glb", NAME, head_parts(mesh), toy_maps(), blinking)
+    content, binary = chunks(tmp_path / "a.glb")
+    animation = content["animations"][0]
+    (channel,) = (row for row in animation["channels"] if row["target"]["path"] == "weights")
+    assert channel["target"]["node"] == 0
+    weights = accessor(content, binary, animation["samplers"][channel["sampler"]]["output"]).reshape(len(FRAMES), 3)
+    left = lids[:, 1]
+    np.testing.assert_allclose(weights, np.stack([0 * left, left, 1 - np.abs(2 * left - 1)], axis=1), atol=1e-6)
+    assert glb_errors(tmp_path / "a.glb") == []
+    without = chunks(tmp_path / "b.glb")[0]["animations"][0]
+    assert all(row["target"]["path"] != "weights" for row in without["channels"])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from shapes import nods, sphere
 
+from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.transforms import project, rotation_from_vector
 from shared.io.arrays import load_arrays, read_json
 from shared.io.images import read_exr
@@ -175,3 +176,20 @@ def test_agrees_with_the_solvers_own_render(tiny_run):
     both = ((expected > 0).all(-1) & (found > 0).all(-1)).astype(np.uint8)
     inside = cv2.erode(both, np.ones((5, 5), np.uint8)) > 0  # the views fade out at the head's edge, the renders do not
     assert inside.mean() > 0.1 and psnr(expected[inside], found[inside]) > 40.0
+
+
+def test_lids_move_as_a_camera_says():
+    """Two halves of a ball that blinks take away: the picture shrinks on the side of the eye that is shut."""
+    mesh = ball()
+    right = np.where(mesh.vertices[:, :1] < -20.0, [[40.0, 0.0, 0.0]], 0.0)
+    left = np.where(mesh.vertices[:, :1] > 20.0, [[-40.0, 0.0, 0.0]], 0.0)
+    blinks = BlendShape.of("right", right, 0.0), BlendShape.of("left", left, 0.0)
+    views, camera = HeadViews(mesh, ball_maps(0.0), SIZES, blinks=blinks), orbit_camera(mesh, 0.0, 0.0, PIXELS)
+    cameras = [camera, *(replace(camera, lids=np.array(lids)) for lids in ([0.0, 0.0], [1.0, 0.0], [0.0, 0.5]))]
+    rest, still, one, half = views.render(even_light(), cameras)
+    np.testing.assert_array_equal(rest, still)
+    columns = [np.nonzero((picture > 0.0).any((0, 2)))[0] for picture in (rest, one, half)]
+    millimetre = (columns[0][-1] - columns[0][0]) / (2.0 * RADIUS)
+    assert columns[1][0] - columns[0][0] == pytest.approx(40.0 * millimetre, abs=2)
+    assert columns[1][-1] == columns[0][-1]
+    assert columns[0][-1] - columns[2][-1] == pytest.approx(20.0 * millimetre, abs=2)

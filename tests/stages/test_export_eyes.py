@@ -125,6 +125,7 @@ def test_obj_and_poses_hold_the_eyes(exported):
     poses = load_arrays(folder / "poses.npz")
     np.testing.assert_array_equal(poses["gaze"], toy_gaze())
     np.testing.assert_array_equal(poses["eye_turn"], toy_gaze())
+    np.testing.assert_array_equal(poses["lids"], np.where(OPEN, 0.0, 1.0)[:, None] * np.ones(2))
     assert field_faults(poses, EXPORTED_POSES) == []
 
 

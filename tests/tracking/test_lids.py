@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shared.geometry.transforms import WORLD_FROM_CAMERA, project, rigid, rotation_from_vector
-from shared.tracking.lids import from_shut, lid_apertures, lids_of
+from shared.tracking.lids import SLACK, closures, from_shut, lid_apertures, lids_of
 
 FRAMES = 80
 INTRINSICS = np.array([[1700.0, 0.0, 320.0], [0.0, 1700.0, 320.0], [0.0, 0.0, 1.0]])
@@ -86,3 +86,17 @@ def test_openness_counts_from_what_shut_lids_read():
     assert np.allclose(from_shut(blinks)[:, 1], [0.0, 0.5, 1.0])
     assert np.allclose(from_shut(blinks)[[0, 2], 0], [1.0, -1.0 / 3.0])
     assert np.allclose(from_shut(open_eyes), (open_eyes - 0.1) / 0.9)
+
+
+def test_lids_are_shut_as_far_as_their_aperture_says():
+    """Open eyes that wander are open, a blink shuts all the way, and half of the way is half but for the slack."""
+    openness = np.array([1.0, 1.1, 0.95, 0.55, 0.1, 0.55, 1.0])[:, None] * np.ones(2)
+    half = (0.5 - SLACK) / (1.0 - SLACK)
+    expected = np.array([0.0, 0.0, 0.0, half, 1.0, half, 0.0])[:, None] * np.ones(2)
+    np.testing.assert_allclose(closures(openness), expected, atol=1e-12)
+
+
+def test_lids_that_are_not_seen_do_as_the_others():
+    openness = np.array([[1.0, 1.0], [0.1, np.nan], [np.nan, np.nan], [1.0, 1.0]])
+    np.testing.assert_allclose(closures(openness), [[0.0, 0.0], [1.0, 1.0], [0.5, 0.5], [0.0, 0.0]])
+    np.testing.assert_array_equal(closures(np.full((3, 2), np.nan)), np.zeros((3, 2)))

@@ -1,7 +1,8 @@
 """The held-out frames of a run rendered anew from what it wrote, and where in them skin, eyes, lips and head are.
 
 The run itself re-renders a few frames, most of them fitted. Here one renderer makes all held-out ones from mesh, maps,
-light and poses, with visibility and bounces; the normal map, which the run's own re-renders leave out too, is left out.
+light and poses, with visibility and bounces, gaze and lids; the normal map, which the run's own re-renders leave out
+too, is left out.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from shared.actions.facial import facial_actions
 from shared.errors import InputError
+from shared.geometry.blend_shapes import BLINKS, blinks_of
 from shared.geometry.mesh import interpolate
 from shared.geometry.raycast import camera_hits
 from shared.geometry.surface import Surface
@@ -27,6 +30,8 @@ from shared.io.material_maps import read_material
 from shared.rendering.precomputed_transfer import Sizes
 from shared.rendering.studio_lights import studio_light
 from shared.rendering.views import HeadViews, ViewCamera, clip_camera
+from shared.tracking.lids import closures
+from shared.tracking.models import load_head_model
 from tools.relight.inputs import Asset, open_asset
 from tools.scoring.held_out import HeldOutFrame
 
@@ -64,7 +69,8 @@ class SolvedClip:
         cameras = [item.camera for item in self.held_out]
         turn = any(camera.gaze is not None for camera in cameras)
         eyes = TurningEyes.of(Surface(self.asset.mesh, segment, tuple(names))) if turn else None
-        self.views = HeadViews(self.asset.mesh, self.asset.maps, SIZES, cameras, eyes=eyes)
+        blinks = facial_actions(load_head_model(), self.asset.mesh.vertices, self.asset.mesh.faces, BLINKS)
+        self.views = HeadViews(self.asset.mesh, self.asset.maps, SIZES, cameras, eyes=eyes, blinks=blinks_of(blinks))
 
     def compared(self) -> list[HeldOutFrame]:
         """Every held-out frame beside its re-render under the clip's light."""
@@ -134,7 +140,9 @@ def region_pixels(shown: np.ndarray, sure: np.ndarray) -> dict[str, np.ndarray]:
 
 def _held_out(work: Path, frames: FrameSet, at_most: int) -> list[HeldOutCamera]:
     """The frames that inverse_render held out, with its poses and the lens of track_landmarks."""
-    solved = load_arrays(work / "inverse_render" / "poses.npz")
+    solved, seen = (load_arrays(work / name) for name in ("inverse_render/poses.npz", "track_landmarks/landmarks.npz"))
+    if "eye_openness" in seen:
+        solved["lids"] = closures(seen["eye_openness"][np.searchsorted(seen["frame_index"], solved["frame_index"])])
     lens = solved["intrinsics_crop"]
     place = {int(frame): k for k, frame in enumerate(solved["frame_index"])}
     numbers = read_json(work / "inverse_render" / "solve.json")["held_out_frames"]
