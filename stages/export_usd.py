@@ -114,17 +114,13 @@ def read_surface(job: Job, mesh):
 
 def read_poses(job: Job) -> dict:
     """inverse_render's poses.npz, and the lids of its frames where they were seen."""
-    import numpy as np
+    from shared.io.arrays import load_arrays, read_json
+    from shared.tracking.eyes import lids_in_frames
 
-    from shared.io.arrays import load_arrays
-    from shared.tracking.lids import closures
-
-    poses = load_arrays(job.input("inverse_render") / "poses.npz")
-    seen = load_arrays(job.input("track_landmarks") / "landmarks.npz")
-    if "eye_openness" not in seen:
-        return poses
-    place = np.searchsorted(seen["frame_index"], poses["frame_index"])
-    return poses | {"lids": closures(seen["eye_openness"][place])}
+    poses, tracked = load_arrays(job.input("inverse_render") / "poses.npz"), job.input("track_landmarks")
+    record = read_json(tracked / "tracking.json")
+    lids = lids_in_frames(load_arrays(tracked / "landmarks.npz"), record, poses["frame_index"])
+    return poses if lids is None else poses | {"lids": lids}
 
 
 def find_actions(job: Job, surface) -> tuple[tuple, dict]:

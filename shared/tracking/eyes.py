@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from shared.geometry.eyeballs import SIDES, eyeballs_of
 from shared.geometry.surface import Surface
 from shared.tracking.gaze import CENTRE_SIGMA_MM, Gaze, iris_distance, solve_gaze
 from shared.tracking.head_scale import BY_MODEL, HeadScale, scale_by_iris, scale_by_length
-from shared.tracking.lids import Lids, lids_of
+from shared.tracking.lids import Lids, closures, lids_of
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,16 @@ def track_eyes(
         seen.iris_px, ~lids.shut, centres, iris_distance(eyeballs), camera_from_head, intrinsics, time_s
     )
     return TrackedEyes(seen, lids, gaze)
+
+
+def lids_in_frames(landmarks: Mapping[str, np.ndarray], record: Mapping, frame_index: np.ndarray) -> np.ndarray | None:
+    """How far each eye is shut, [F, 2] as closures has it, in frames frame_index [F] of those tracked; None where the
+    eyes were not. landmarks: of landmarks.npz; record: tracking.json."""
+    if "eye_openness" not in landmarks:
+        return None
+    said = record.get("eyes", {})
+    shut = np.stack([np.isin(frame_index, said.get(f"shut_{name}", ())) for name in SIDES], axis=1)
+    return closures(landmarks["eye_openness"][np.searchsorted(landmarks["frame_index"], frame_index)], shut)
 
 
 def head_scale(surface: Surface, eyes: TrackedEyes | None, pupil_distance_mm: float | None) -> HeadScale:

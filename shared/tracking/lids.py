@@ -69,15 +69,17 @@ def from_shut(openness: np.ndarray) -> np.ndarray:
     return (openness - reads) / (1.0 - reads)
 
 
-def closures(openness: np.ndarray) -> np.ndarray:
-    """openness [F, 2] of lids -> how far each eye is shut, [F, 2]: 0 as open eyes are, 1 shut. Where an eye is not seen
-    its lids do as the other one's, where neither is, as in the frames before and after."""
-    shut = (1.0 - from_shut(openness) - SLACK) / (1.0 - SLACK)
-    shut = np.clip(np.where(np.isfinite(shut), shut, shut[:, ::-1]), 0.0, 1.0)
-    known = np.nonzero(np.isfinite(shut).all(1))[0]
+def closures(openness: np.ndarray, shut: np.ndarray) -> np.ndarray:
+    """openness [F, 2] of lids and shut [F, 2] bool, see Lids -> how far each eye is shut, [F, 2]: 0 as the clip's open
+    eyes are, 1 shut. Where an eye is not seen its lids do as the other one's, where neither is, as in the frames before
+    and after. Eyes that are shut throughout have no others than themselves: 0."""
+    apart = np.where(np.isfinite(openness), openness, openness[:, ::-1])
+    known = np.nonzero(np.isfinite(apart).all(1))[0]
     if not len(known):
-        return np.zeros_like(shut)
-    return np.stack([np.interp(np.arange(len(shut)), known, own[known]) for own in shut.T], axis=1)
+        return np.zeros_like(openness)
+    way = np.clip((1.0 - _together(from_shut(apart[known])) - SLACK) / (1.0 - SLACK), 0.0, 1.0)
+    way[:, shut[known].all(0)] = 0.0
+    return np.stack([np.interp(np.arange(len(openness)), known, own) for own in way.T], axis=1)
 
 
 def _together(values: np.ndarray) -> np.ndarray:

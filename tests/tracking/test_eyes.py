@@ -10,7 +10,7 @@ from shared.geometry.eyeballs import eyeballs_of
 from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface
 from shared.geometry.transforms import project
-from shared.tracking.eyes import track_eyes
+from shared.tracking.eyes import lids_in_frames, track_eyes
 
 LENS = np.array([[2700.0, 0, 400], [0, 2700.0, 400], [0, 0, 1]])
 FRAMES = 40
@@ -75,3 +75,15 @@ def test_a_mesh_without_eyeballs_has_no_eyes(model):
     surface = surface_of(model)
     bare = Surface(surface.mesh)
     assert track_eyes(bare, seen_eyes(surface), POSES, LENS, np.arange(FRAMES) / 15.0) is None
+
+
+def test_lids_in_frames_are_those_of_the_frames_asked_for():
+    """Of the eyes that tracking.json calls shut throughout none moves."""
+    frames = np.array([2, 4, 6, 9])
+    landmarks = {"frame_index": frames, "eye_openness": np.array([1.0, 0.1, 1.0, 0.1])[:, None] * np.ones(2)}
+    blinks = {"eyes": {"shut_right": [4, 9], "shut_left": [4, 9]}}
+    found = lids_in_frames(landmarks, blinks, frames[[0, 1, 3]])
+    np.testing.assert_allclose(found, [[0, 0], [1, 1], [1, 1]], atol=1e-12)
+    shut = {"eyes": {"shut_right": [2, 4, 6, 9], "shut_left": [4, 9]}}
+    assert lids_in_frames(landmarks, shut, frames)[:, 0].tolist() == [0.0] * 4
+    assert lids_in_frames({"frame_index": frames}, blinks, frames) is None

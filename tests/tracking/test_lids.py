@@ -93,10 +93,19 @@ def test_lids_are_shut_as_far_as_their_aperture_says():
     openness = np.array([1.0, 1.1, 0.95, 0.55, 0.1, 0.55, 1.0])[:, None] * np.ones(2)
     half = (0.5 - SLACK) / (1.0 - SLACK)
     expected = np.array([0.0, 0.0, 0.0, half, 1.0, half, 0.0])[:, None] * np.ones(2)
-    np.testing.assert_allclose(closures(openness), expected, atol=1e-12)
+    np.testing.assert_allclose(closures(openness, openness < 0.3), expected, atol=1e-12)
+
+
+def test_eyes_that_are_shut_throughout_stay_as_they_are():
+    """What the network reads between shut lids wanders by more than half."""
+    openness = np.array([[1.0, 1.0], [0.2, 1.0], [1.4, 0.1], [np.nan, 1.0]])
+    sometimes = np.array([[True, False]] * 2 + [[True, True], [False, False]])
+    assert (closures(openness, sometimes).max(0) > 0.3).all()
+    np.testing.assert_array_equal(closures(openness, np.ones((4, 2), bool)), np.zeros((4, 2)))
 
 
 def test_lids_that_are_not_seen_do_as_the_others():
     openness = np.array([[1.0, 1.0], [0.1, np.nan], [np.nan, np.nan], [1.0, 1.0]])
-    np.testing.assert_allclose(closures(openness), [[0.0, 0.0], [1.0, 1.0], [0.5, 0.5], [0.0, 0.0]])
-    np.testing.assert_array_equal(closures(np.full((3, 2), np.nan)), np.zeros((3, 2)))
+    shut = openness < 0.5
+    np.testing.assert_allclose(closures(openness, shut), [[0.0, 0.0], [1.0, 1.0], [0.5, 0.5], [0.0, 0.0]])
+    np.testing.assert_array_equal(closures(np.full((3, 2), np.nan), np.zeros((3, 2), bool)), np.zeros((3, 2)))

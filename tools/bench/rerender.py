@@ -30,7 +30,7 @@ from shared.io.material_maps import read_material
 from shared.rendering.precomputed_transfer import Sizes
 from shared.rendering.studio_lights import studio_light
 from shared.rendering.views import HeadViews, ViewCamera, clip_camera
-from shared.tracking.lids import closures
+from shared.tracking.eyes import lids_in_frames
 from shared.tracking.models import load_head_model
 from tools.relight.inputs import Asset, open_asset
 from tools.scoring.held_out import HeldOutFrame
@@ -140,9 +140,10 @@ def region_pixels(shown: np.ndarray, sure: np.ndarray) -> dict[str, np.ndarray]:
 
 def _held_out(work: Path, frames: FrameSet, at_most: int) -> list[HeldOutCamera]:
     """The frames that inverse_render held out, with its poses and the lens of track_landmarks."""
-    solved, seen = (load_arrays(work / name) for name in ("inverse_render/poses.npz", "track_landmarks/landmarks.npz"))
-    if "eye_openness" in seen:
-        solved["lids"] = closures(seen["eye_openness"][np.searchsorted(seen["frame_index"], solved["frame_index"])])
+    solved, tracked = load_arrays(work / "inverse_render" / "poses.npz"), work / "track_landmarks"
+    record = read_json(tracked / "tracking.json")
+    lids = lids_in_frames(load_arrays(tracked / "landmarks.npz"), record, solved["frame_index"])
+    solved |= {} if lids is None else {"lids": lids}
     lens = solved["intrinsics_crop"]
     place = {int(frame): k for k, frame in enumerate(solved["frame_index"])}
     numbers = read_json(work / "inverse_render" / "solve.json")["held_out_frames"]
