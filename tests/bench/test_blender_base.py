@@ -9,7 +9,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from model_export import read_rgba, variant_scene, write_model_work
+from model_export import FROM_THE_FRONT, read_rgba, variant_scene, write_model_work
 from scipy.spatial import cKDTree
 from toy_result import ToyJob
 from trimesh.triangles import closest_point
@@ -43,15 +43,9 @@ for other in bpy.data.objects:
     other.hide_render = other.type == "MESH" and other is not head
 scene = bpy.context.scene
 scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
-scene.render.film_transparent = True
 scene.render.resolution_x = scene.render.resolution_y = 400
-scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
-scene.render.image_settings.color_mode = "RGBA"
-camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
-camera.data.type, camera.data.ortho_scale = "ORTHO", 0.24
-camera.matrix_world = head.matrix_world.normalized() @ Matrix.Translation((0.0, 0.0, 1.0))
-scene.collection.objects.link(camera)
-scene.camera, scene.render.filepath = camera, str(folder / "places.exr")
+""" + FROM_THE_FRONT + """
+scene.render.filepath = str(folder / "places.exr")
 bpy.ops.render.render(write_still=True)
 print("FOUND" + json.dumps({
     "uv_smooth": smooth.uv_smooth, "boundary": smooth.boundary_smooth, "limit": smooth.use_limit_surface,

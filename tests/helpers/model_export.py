@@ -15,6 +15,17 @@ from shared.io.meshes import save_mesh
 from shared.tracking.fit_eyeballs import set_eyeballs
 from shared.tracking.models import load_head_model
 
+FROM_THE_FRONT = """
+scene.render.film_transparent = True
+scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
+scene.render.image_settings.color_mode = "RGBA"
+camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+camera.data.type, camera.data.ortho_scale = "ORTHO", 0.24
+camera.matrix_world = head.matrix_world.normalized() @ Matrix.Translation((0.0, 0.0, 1.0))
+scene.collection.objects.link(camera)
+scene.camera = camera
+"""
+"""Of a script for Blender that has a scene and a head: a camera 240 mm wide before it, and pictures for read_rgba."""
 HIDDEN = ("eyes", "eye_sockets", "inner_mouth")
 
 
