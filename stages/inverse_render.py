@@ -69,7 +69,7 @@ PUBLISHED = ParameterGroup(
 
 STAGE = Stage(
     name="inverse_render",
-    version=37,
+    version=38,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -179,14 +179,12 @@ def write_maps(job: Job, result) -> None:
         write_exr(job.out / "maps" / f"{name}.exr", image, colour_space=colour_space, attributes=attributes)
 
 
-def write_material_map(job: Job, surface, result) -> None:
-    """maps/material.exr; surface: as it was tracked, with its segments."""
-    from shared.compute.run_context import RunContext
-    from shared.inverse.material_map import material_map
+def write_material_map(job: Job, result) -> None:
+    """maps/material.exr."""
+    from shared.inverse.material_map import material_image
     from shared.io.material_maps import write_material
 
-    context = RunContext(job.progress, job.note)
-    probabilities = material_map(result, surface, len(result.maps["confidence"]), context)
+    probabilities = material_image(result.viewer, result.materials, len(result.maps["confidence"]))
     write_material(job.out / "maps" / "material.exr", probabilities, half=True, attributes={"content": "material"})
 
 
@@ -318,7 +316,7 @@ def run(job: Job) -> None:
     for text in record["warnings"]:
         job.warn(text)
     write_maps(job, result)
-    write_material_map(job, surface, result)
+    write_material_map(job, result)
     write_shape(job, surface, result.viewer.mesh)
     lights, own = np.split(result.solution.state.light, len(clips)), []
     for k, (clip, rows) in enumerate(zip(clips, views.frames_of_lights, strict=True)):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import TypeVar
 
 import numpy as np
@@ -54,6 +55,15 @@ fit the mean a little better there, too (0.7 %; re-renders + 0.5 dB, albedo - 0.
 so by a fiftieth."""
 REFLECTION = slice(7, 10)
 """Columns of S in the table of a frame's view."""
+HIDING_SPREAD, MOST_HIDDEN = 1.0, 0.999
+"""Typical difference in log albedo between skin and what hangs before it, and the most that is believed of the
+probability that something does."""
+SEAM_STEPS = 8
+"""Edges over which what no frame shows turns from what it lies beside to what its surroundings suggest."""
+LEAST_KNOWN = 0.1
+"""Information on a texel's log albedo from which on it is rather known than not."""
+HELD_AT_SEAM = 100.0
+"""How much more vertices that frames show count there than one edge between two."""
 FIRST_PASS_FRAMES = 32
 """Enough to tell what a texel looks like, so that every frame's samples can be weighed by it."""
 
@@ -82,6 +92,7 @@ class TexturePass:
     region [V] bool: the part of the head that hair may cover, of which skin says nothing, nor it of skin;
     bare [V] bool: bare skin, None: all; of brows, lips or clothes the skin around says nothing, however much frames
     contradict each other there;
+    hidden [V]: probability that frames show what hangs before a place, and so say nothing of it; None: nowhere;
     eyes: texels that turn with the views' gaze, and of which skin says nothing; None: none do.
     """
 
@@ -98,6 +109,7 @@ class TexturePass:
         light_weights: Sequence[float] = (),
         region: np.ndarray | None = None,
         bare: np.ndarray | None = None,
+        hidden: np.ndarray | None = None,
         context: RunContext = SILENT,
         eyes: EyeTexels | None = None,
     ):
@@ -114,6 +126,10 @@ class TexturePass:
             self.specular = self._with_eyes(np.full(len(surface), specular, np.float32))
         self.region = region
         self.bare = 1.0 if bare is None else surface.interpolate(bare[:, None].astype(np.float32))
+        self.hidden_variance = 0.0
+        if hidden is not None:
+            share = np.minimum(surface.interpolate(hidden[:, None]), MOST_HIDDEN)
+            self.hidden_variance = np.square(HIDING_SPREAD * share / (1.0 - share))
 
     def _systematic(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """[T, 3] twice: variance of the log albedo that all frames of one light share, by the irradiance and by the
@@ -130,7 +146,7 @@ class TexturePass:
         fitted = np.nonzero(self.views.fitted)[0]
         some = fitted[spread_frames(len(fitted), FIRST_PASS_FRAMES, self.views.light_index[fitted])]
         fields = SmoothFields(self.surface.mesh, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD, self.region)
-        first = self._close(self._accumulate(None, some, "texture, first pass"), [mean], fields)[0]
+        first, _ = self._close(self._accumulate(None, some, "texture, first pass"), [mean], fields)[0]
         evidence = self._accumulate(first, fitted, "texture, second pass")
         pooled = [
             pooled_specular(self.surface, evidence.equations, width, mean=self.specular, sigma=self.sigma)
@@ -138,7 +154,8 @@ class TexturePass:
         ]
         if self.eyes is not None:
             pooled = [self._with_eyes(intensity) for intensity in pooled]
-        candidates = self._close(evidence, pooled, fields)
+        candidates, around = zip(*self._close(evidence, pooled, fields), strict=True)
+        told = evidence.information.max(1)
         del evidence, fields  # a hundred bytes per texel that the frames to come need
         errors = np.reshape(self.held_out_errors(candidates), (len(CONTRADICTED), len(widths)))
         way = int(errors[1].min() < LEAST_GAIN * errors[0].min())
@@ -150,7 +167,8 @@ class TexturePass:
             "contradicted": {"held_out": dict(zip(CONTRADICTED, errors.min(1).tolist(), strict=True)),
                              "chosen": CONTRADICTED[way]},
         }
-        return candidates[way * len(widths) + best], record
+        chosen = way * len(widths) + best
+        return self._without_seams(candidates[chosen], around[chosen], told), record
 
     def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> Evidence:
         parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]
@@ -166,11 +184,12 @@ class TexturePass:
         for (level, turned), border, part, scatter in zip(self.systematic, borders, parts, scatters, strict=True):
             behind, shadow = border.variance()[:, None], part.shadow_variance(self.typical_albedo)
             highlight, scattered = part.highlight_variance(self.specular), scatter.variance()
-            lit, pull = level + turned + behind + shadow, PULL_OVER_SCATTER * self.bare * scattered
+            hidden = self.hidden_variance
+            lit, pull = level + turned + behind + shadow + hidden, PULL_OVER_SCATTER * self.bare * scattered
             systematic.append(lit + highlight + ERROR_OVER_SCATTER * scattered)
             irradiance.append(lit + pull)
             # The level is wrong alike all over a cavity: the skin around knows its albedo no better.
-            mean = turned + BEHIND_OVER_SKIN**2 * behind + shadow
+            mean = turned + BEHIND_OVER_SKIN**2 * behind + shadow + hidden
             drawing.append((mean + highlight + pull, mean))
         return weigh_lights(parts, systematic, self.typical_albedo, irradiance, drawing)
 
@@ -218,34 +237,62 @@ class TexturePass:
 
     def _close(
         self, evidence: Evidence, intensities: list[np.ndarray], fields: SmoothFields
-    ) -> list[TexelMaterial]:
-        """Albedo for each way to draw texels and, inside it, each of some given intensities [T]; channels left open by
-        the samples follow the others and the neighbourhood.
+    ) -> list[tuple[TexelMaterial, np.ndarray]]:
+        """Albedo for each way to draw texels and, inside it, each of some given intensities [T], with the log albedo
+        around [V, 3] that it was drawn to."""
+        equations, information = evidence.equations, evidence.information
+        rough = [equations.solve_albedo(specular, 0.0, 1e-6) for specular in intensities]
+        around = self._surroundings(rough, information, fields).astype(np.float32)
+        brightest = np.maximum(equations.brightest_albedo(evidence.irradiance), LEAST_ALBEDO)
+        ways = list(product(evidence.drawing, range(len(intensities))))
+
+        def drawn(n: int) -> tuple[TexelMaterial, np.ndarray]:
+            drawing, k = ways[n]
+            albedo = self._drawn(evidence, drawing, intensities[k], rough[k], around[..., k])
+            albedo = np.minimum(albedo, brightest).astype(np.float32)
+            return TexelMaterial(albedo, intensities[k], information.min(1)), around[..., k]
+
+        return share_out(len(ways), drawn)
+
+    def _drawn(
+        self, evidence: Evidence, drawing: np.ndarray, specular: np.ndarray, rough: np.ndarray, around: np.ndarray
+    ) -> np.ndarray:
+        """[T, 3] albedo of texels of some specular intensity [T], as their samples alone have it [T, 3] and as far as
+        the variance of these [T, 3] lets them be drawn to the log albedo around [V, 3]; channels left open by the
+        samples follow the others and the neighbourhood.
 
         A channel whose samples have the share q of its albedo leaves 1 - q to a fallback. The texel's brightness b
         beside its neighbourhood, by all channels, is believed by their share q': the fallback has b (q' - q) / (1 - q)
         of it, so that channels that know alike get what their own samples say once, and one that is clipped gets q' b.
         """
         equations, information = evidence.equations, evidence.information
-        rough = [equations.solve_albedo(specular, 0.0, 1e-6) for specular in intensities]
-        around = self._surroundings(rough, information, fields).astype(np.float32)
-        brightest, found = np.maximum(equations.brightest_albedo(evidence.irradiance), LEAST_ALBEDO), []
-        for drawing in evidence.drawing:
-            pull = _ALBEDO_PULL + equations.ee * (drawing / PRIOR_SPREAD**2)
-            own = equations.ee / (equations.ee + pull)
-            certain = own * information / (1.0 + information)
-            total = np.maximum(certain.sum(1, keepdims=True), 1e-9)
-            believed = (certain * own).sum(1, keepdims=True) / total
-            left = np.clip(believed - own, 0.0, 1.0) / np.maximum(1.0 - own, 1e-3)
-            for k, specular in enumerate(intensities):
-                smooth = np.exp(self.surface.interpolate(around[..., k]))
-                if self.eyes is not None:
-                    smooth[self.eyes.rows] = self._round_eyes(rough[k], information)
-                brighter = (certain * np.log(np.maximum(rough[k], 1e-3) / smooth)).sum(1, keepdims=True) / total
-                albedo = equations.drawn_albedo(specular, smooth * np.exp(brighter * left), _ALBEDO_PULL, drawing)
-                albedo = np.minimum(albedo, brightest).astype(np.float32)
-                found.append(TexelMaterial(albedo, specular, information.min(1)))
-        return found
+        pull = _ALBEDO_PULL + equations.ee * (drawing / PRIOR_SPREAD**2)
+        own = equations.ee / (equations.ee + pull)
+        certain = own * information / (1.0 + information)
+        total = np.maximum(certain.sum(1, keepdims=True), 1e-9)
+        believed = (certain * own).sum(1, keepdims=True) / total
+        left = np.clip(believed - own, 0.0, 1.0) / np.maximum(1.0 - own, 1e-3)
+        smooth = np.exp(self.surface.interpolate(around))
+        if self.eyes is not None:
+            smooth[self.eyes.rows] = self._round_eyes(rough, information)
+        brighter = (certain * np.log(np.maximum(rough, 1e-3) / smooth)).sum(1, keepdims=True) / total
+        return equations.drawn_albedo(specular, smooth * np.exp(brighter * left), _ALBEDO_PULL, drawing)
+
+    def _without_seams(self, material: TexelMaterial, around: np.ndarray, told: np.ndarray) -> TexelMaterial:
+        """The material with what no frame shows going on from what lies beside it, where the log albedo around it [V,
+        3] is another: by the membrane that the differences on both sides of the seam span, which sinks to nothing.
+        told [T]: information on the log albedo, of the channel that is known best."""
+        known = told / (told + LEAST_KNOWN)
+        if self.eyes is not None:
+            known[self.eyes.rows] = 0.0
+        apart = np.log(np.maximum(material.albedo, LEAST_ALBEDO)) - self.surface.interpolate(around)
+        means, weight = self.surface.to_vertices(apart, np.repeat(known[:, None], 3, axis=1))
+        membrane = SmoothFields(self.surface.mesh, 1.0, SEAM_STEPS, self.region)
+        step = self.surface.interpolate(membrane.through(means, HELD_AT_SEAM * weight, np.zeros(3)))
+        filled = np.clip(material.albedo * np.exp((1.0 - known[:, None]) * step), LEAST_ALBEDO, 1.0)
+        if self.eyes is not None:
+            filled[self.eyes.rows] = material.albedo[self.eyes.rows]
+        return replace(material, albedo=filled.astype(np.float32))
 
     def _with_eyes(self, intensity: np.ndarray) -> np.ndarray:
         """Specular intensity [T] with the eyeballs' own."""

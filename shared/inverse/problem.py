@@ -55,15 +55,16 @@ class InverseSettings:
 @dataclass(frozen=True)
 class InverseResult:
     """solution of the appearance fit, the texels' material, maps by name, the vertices' shading in all views, the
-    viewer of the final mesh, the views with their poses and which were fitted, and what is worth recording; covariance
-    [F, 6, 6] of poses that were tracked again, None: they are as they were given; eyes: those of the mesh, which turn
-    with the views' gaze, None: they do not."""
+    viewer of the final mesh, what its vertices show [V, len(LABELS)], the views with their poses and which were fitted,
+    and what is worth recording; covariance [F, 6, 6] of poses that were tracked again, None: they are as they were
+    given; eyes: those of the mesh, which turn with the views' gaze, None: they do not."""
 
     solution: Solution
     material: TexelMaterial
     maps: dict[str, np.ndarray]
     shading: VertexShading
     viewer: SurfaceViewer
+    materials: np.ndarray
     views: Views
     record: dict
     covariance: np.ndarray | None = None

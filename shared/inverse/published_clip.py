@@ -24,6 +24,7 @@ from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import TexelSurface
 from shared.imaging.views import Views
+from shared.inverse.material_map import clip_materials
 from shared.inverse.problem import FACE_SKIN, InverseResult, InverseSettings, shade_vertices
 from shared.io.arrays import load_arrays, save_arrays
 from shared.published.settings import ReferenceSettings
@@ -186,7 +187,8 @@ def conclude(
         "albedo_scale": describe_scale(None, np.median(state.albedo, axis=0)) | {"method": SCALE},
         "warnings": [],
     }
-    return InverseResult(solution, material, maps, shading, viewer, views, record)
+    materials = clip_materials(viewer, shading, views, surface, state, context)
+    return InverseResult(solution, material, maps, shading, viewer, materials, views, record)
 
 
 def map_material(solver: ReferenceSolver, average: Average) -> TexelMaterial:

@@ -30,6 +30,7 @@ from shared.inverse.clip_inputs import TrackedPoses
 from shared.inverse.exposure import exposure_warnings, solve_exposure
 from shared.inverse.lamp_distance import describe_lamp, find_lamp
 from shared.inverse.lit_surface import LitSurface, report_to
+from shared.inverse.material_map import clip_materials, hidden_places, matt_share
 from shared.inverse.model_selection import select
 from shared.inverse.problem import (
     FACE_SKIN,
@@ -116,9 +117,15 @@ def solve_clip(
     eyes = None if views.gaze is None else TurningEyes.of(surface)
     eye_texels = None if eyes is None else EyeTexels(texels, viewer, eyes, surface.faces_of(LIDS))
     typical = np.median(solution.state.albedo, axis=0)
+    scalp, specular, hidden = scalp_of(surface), solution.state.specular, None
+    materials = clip_materials(viewer, shading, views, surface, solution.state, context)
+    if scalp is not None:
+        hidden = hidden_places(viewer, surface, materials)
+        matt = matt_share(viewer, surface, materials, hidden, scalp)
+        specular = (specular * (1.0 - texels.interpolate(matt[:, None])[:, 0])).astype(np.float32)
     texture = TexturePass(
-        texels, viewer, shading, views, specular=solution.state.specular, typical_albedo=typical,
-        light_weights=solution.light_weights, region=scalp_of(surface), bare=surface.vertices_of(FACE_SKIN),
+        texels, viewer, shading, views, specular=specular, typical_albedo=typical,
+        light_weights=solution.light_weights, region=scalp, bare=surface.vertices_of(FACE_SKIN), hidden=hidden,
         context=context, eyes=eye_texels,
     )
     widths = settings.map_size * np.array(SPECULAR_WIDTHS if settings.appearance.specular else (np.inf,))
@@ -147,7 +154,7 @@ def solve_clip(
         "model_selection": () if selected is None else selected.candidates,
     }
     maps = make_maps(texels, material, roughness, turn, None if eye_texels is None else eye_texels.rows)
-    return InverseResult(solution, material, maps, shading, viewer, views, record, covariance, eyes)
+    return InverseResult(solution, material, maps, shading, viewer, materials, views, record, covariance, eyes)
 
 
 def said_by_chart(

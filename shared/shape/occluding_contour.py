@@ -18,6 +18,7 @@ import numpy as np
 import scipy.sparse as sparse
 
 from shared.compute.robust import cauchy_weight
+from shared.compute.threads import share_out
 from shared.geometry.mesh import Mesh, mesh_edges, normalised, vertex_normals
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import camera_centres, pixel_rays, project, projection_slope
@@ -147,8 +148,10 @@ def occluding_contour(
     of_face, bare = np.zeros(len(mesh.vertices), bool), np.unique(mesh.faces[outlined.bare])
     of_face[mesh.faces[outlined.face]] = True
     known_mm = outlined.vertices_known_mm(mesh)
-    parts, met, count = [], 0, 0
-    for f, (pose, lens) in enumerate(zip(views.camera_from_head, views.intrinsics, strict=True)):
+
+    def of_frame(f: int) -> tuple[tuple[np.ndarray, ...], int, int]:
+        """The view's part of the contour, how many of its free points have a border near, and how many they are."""
+        pose, lens = views.camera_from_head[f], views.intrinsics[f]
         cosine = (normalised(camera_centres(pose) - mesh.vertices) * normals).sum(1)
         turning = _turning_points(mesh, normals, cosine, edges, scene, pose, lens)
         pixels, outward = turning.pixels, turning.outward
@@ -156,7 +159,7 @@ def occluding_contour(
         px_per_mm = lens[0, 0] / turning.depth
         apart = remap(outlines.distances[f], pixels).astype(np.float64)
         near = inside & turning.free & (np.abs(apart) < settings.reach_mm * px_per_mm)
-        met, count = met + int(near.sum()), count + int((inside & turning.free).sum())
+        met, count = int(near.sum()), int((inside & turning.free).sum())
         on_edge = np.zeros(len(apart), bool)
         sought = np.nonzero(inside & of_face[turning.edge].all(1))[0]
         if len(sought):
@@ -171,9 +174,11 @@ def occluding_contour(
             apart[sought[own]], on_edge[sought[own]] = -edge[own], True
         near = near & bordered | on_edge
         values = turning.edge, turning.share, turning.slope, apart, on_edge
-        parts.append((np.full(near.sum(), f), *(value[near] for value in values)))
+        return (np.full(near.sum(), f), *(value[near] for value in values)), met, count
+
+    parts, met, counts = zip(*share_out(len(views), of_frame), strict=True)
     arrays = [np.concatenate(part) for part in zip(*parts, strict=True)]
-    return OccludingContour(*arrays, met=met / max(count, 1))
+    return OccludingContour(*arrays, met=sum(met) / max(sum(counts), 1))
 
 
 class _TurningPoints(NamedTuple):

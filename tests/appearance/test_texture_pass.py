@@ -139,6 +139,7 @@ def test_unseen_texels_are_filled_and_not_trusted(plate):
 def test_what_no_frame_shows_is_hair_where_the_rest_of_it_is(monkeypatch):
     """A fill that soon sinks to what is usual: typical skin, but in a region of its own that region's mean."""
     monkeypatch.setattr(texture_pass, "SURROUNDINGS_SPREAD", 0.02)
+    monkeypatch.setattr(texture_pass, "SEAM_STEPS", 0.5)
     found = {}
     for region_from in (None, 0.6):
         surface, material, *_ = run_pass(region_from=region_from)
@@ -148,6 +149,45 @@ def test_what_no_frame_shows_is_hair_where_the_rest_of_it_is(monkeypatch):
     own = np.exp(np.log(true_albedo(uv[known])).mean(0))
     assert np.abs(np.log(found[None] / TYPICAL)).max() < 0.03
     assert np.abs(np.log(found[0.6] / own)).max() < 0.08 < np.abs(np.log(own / TYPICAL)).max()
+
+
+def test_what_no_frame_shows_goes_on_from_what_lies_beside_it(monkeypatch):
+    """A fill that soon sinks to typical skin would begin with a step at the border of what is seen."""
+    monkeypatch.setattr(texture_pass, "SURROUNDINGS_SPREAD", 0.02)
+    step, far = {}, {}
+    for edges in (8, 2, 0):
+        if edges:
+            monkeypatch.setattr(texture_pass, "SEAM_STEPS", edges)
+        else:
+            monkeypatch.setattr(TexturePass, "_without_seams", lambda self, material, around, told: material)
+        surface, material, *_ = run_pass()
+        image = surface.to_image(np.log(material.albedo))[4:-4]
+        step[edges] = np.abs(np.diff(image, axis=1)).max(2)[:, int(0.6 * MAP) :].max()
+        far[edges] = np.abs(image[:, -1] - np.log(TYPICAL)).max()
+    assert step[8] < 0.08 < 0.15 < step[0]
+    assert far[0] < 0.01 < far[2] < 0.1 < far[8]
+
+
+def test_what_hangs_before_a_place_says_nothing_of_it():
+    """Dark hair, before a third of the plate."""
+    mesh = grid_plane(33, 80.0)
+    hair = mesh.uvs[:, :1] < 0.3
+
+    class HairyPlate(PlateShading):
+        def irradiance(self, frame):
+            return super().irradiance(frame) * np.where(hair, 4.0, 1.0).astype(np.float32)
+
+    surface, viewer, views = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh), plate_views(mesh, PlateShading(mesh))
+    uv, error, confidence = texel_uv(surface), [], []
+    for hidden in (None, hair[:, 0].astype(float)):
+        texture = TexturePass(surface, viewer, HairyPlate(mesh), views, SPECULAR, TYPICAL, hidden=hidden)
+        material, _ = texture.run((np.inf,))
+        error.append(np.log(material.albedo / true_albedo(uv)).mean(1))
+        confidence.append(make_maps(surface, material, 0.4)["confidence"].ravel()[surface.pixel])
+    covered, beside = uv[:, 0] < 0.25, (np.abs(uv - [0.55, 0.5]) < [0.15, 0.45]).all(1)
+    assert np.median(error[0][covered]) < -1.2 and np.abs(error[1][covered]).max() < 0.45
+    assert np.abs(error[1][beside]).max() < 0.03
+    assert confidence[1][covered].max() < 0.01 and np.median(confidence[1][beside]) > 0.8
 
 
 def test_more_frames_mean_more_confidence():
