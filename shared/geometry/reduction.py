@@ -40,9 +40,10 @@ _PLACES = ((0.6, 0.2, 0.2), (0.2, 0.6, 0.2), (0.2, 0.2, 0.6), (0.45, 0.45, 0.1),
 """Corner weights of the points on a face where its distance is measured."""
 SLIMMEST = 0.05
 """Twice a face's area over the sum of its squared sides, below which it does not get slimmer: 0.58 is equilateral."""
-WEIGHTS = {"eyes": 8.0, "lids": 8.0, "lips": 4.0}
-"""How much faces of some segments count against others: whoever looks at a face looks there first, lids must fit about
-an eyeball that turns, and lips upon each other."""
+_FACE = ("forehead", "brows", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "chin", "jaw")
+WEIGHTS = {"eyes": 8.0, "lids": 8.0, "lips": 8.0, **dict.fromkeys(_FACE, 2.0)}
+"""How much faces of some segments count against others: whoever looks at a head looks at its face, there at eyes and
+lips first; lids must fit about an eyeball that turns, and lips upon each other."""
 _SEAM, _OUTLINE, _BORDER, _FIXED = 1, 2, 4, 8
 _MOST_FACES = 64
 """Around a vertex that may still be taken away."""

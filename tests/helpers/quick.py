@@ -10,7 +10,7 @@ SETTINGS = (
     "inverse_render.bounce_nodes=50", "inverse_render.light_resolution=4", "inverse_render.light_frames=4",
     "inverse_render.light_steps=2", "inverse_render.map_size=64", "inverse_render.render_count=1",
     "inverse_render.fit_roughness=false", "inverse_render.shape=false", "export_usd.report_frames=1",
-    "export_usd.view_size=64",
+    "export_usd.view_size=64", "export_usd.actions=false", "export_usd.detail=false",
 )
 QUICK = tuple(word for setting in SETTINGS for word in ("--set", setting))
 """Arguments of `limn run`."""

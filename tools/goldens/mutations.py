@@ -62,7 +62,7 @@ MUTATIONS = (
     Mutation("views: studio lamps", "export_usd", "shared/rendering/studio_lights.py", "share = 0.5 + 0.5 *",
              "share = 0.525 + 0.5 *"),
     Mutation("views: framing", "export_usd", "shared/rendering/views.py", "DISTANCE_MM, FILLED = 900.0, 1.1",
-             "DISTANCE_MM, FILLED = 900.0, 1.155", quick=True),
+             "DISTANCE_MM, FILLED = 900.0, 1.155"),
 )
 
 
