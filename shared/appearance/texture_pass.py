@@ -55,9 +55,9 @@ fit the mean a little better there, too (0.7 %; re-renders + 0.5 dB, albedo - 0.
 so by a fiftieth."""
 REFLECTION = slice(7, 10)
 """Columns of S in the table of a frame's view."""
-HIDING_SPREAD, MOST_HIDDEN = 1.0, 0.999
-"""Typical difference in log albedo between skin and what hangs before it, and the most that is believed of the
-probability that something does."""
+HIDING_SPREAD, LEAST_SEEN = 1.0, 0.001
+"""Typical difference in log albedo between skin and what hangs before it, and the least that is believed of the
+probability that nothing does."""
 SEAM_STEPS = 8
 """Edges over which what no frame shows turns from what it lies beside to what its surroundings suggest."""
 LEAST_KNOWN = 0.1
@@ -86,13 +86,13 @@ class LitSamples:
 class TexturePass:
     """Per-texel albedo and specular intensity under a fixed light, roughness and geometry.
 
-    specular: the clip's one intensity or each texel's [T], the prior's mean; typical_albedo [3]; sigma: how far a texel
-    may leave it;
+    specular: the clip's one intensity, the prior's mean; typical_albedo [3]; sigma: how far a texel may leave it;
     light_weights: how much samples of each light count, by how well the model follows it; empty: all alike;
     region [V] bool: the part of the head that hair may cover, of which skin says nothing, nor it of skin;
     bare [V] bool: bare skin, None: all; of brows, lips or clothes the skin around says nothing, however much frames
     contradict each other there;
     hidden [V]: probability that frames show what hangs before a place, and so say nothing of it; None: nowhere;
+    matt [V]: share of what has no highlights of the surface's lobe; None: none has;
     eyes: texels that turn with the views' gaze, and of which skin says nothing; None: none do.
     """
 
@@ -102,7 +102,7 @@ class TexturePass:
         viewer: SurfaceViewer,
         shading: VertexShading,
         views: Views,
-        specular: float | np.ndarray,
+        specular: float,
         typical_albedo: np.ndarray,
         sigma: float = 0.25,
         noise: Noise | None = None,
@@ -110,6 +110,7 @@ class TexturePass:
         region: np.ndarray | None = None,
         bare: np.ndarray | None = None,
         hidden: np.ndarray | None = None,
+        matt: np.ndarray | None = None,
         context: RunContext = SILENT,
         eyes: EyeTexels | None = None,
     ):
@@ -121,15 +122,16 @@ class TexturePass:
             tuple(error / weight for error in self._systematic(own))
             for own, weight in zip(lights, self.light_weights, strict=True)
         ]
-        self.specular, self.sigma, self.noise, self.progress = specular, sigma, noise or Noise(), context.progress
-        if eyes is not None:
-            self.specular = self._with_eyes(np.full(len(surface), specular, np.float32))
+        self.sigma, self.noise, self.progress = sigma, noise or Noise(), context.progress
+        self.shines = np.ones(len(surface), np.float32) if matt is None else self._at_texels(1.0 - matt)
+        self.seen = None if hidden is None else self._at_texels(1.0 - hidden)
+        self.specular = self._with_eyes(specular * self.shines)
         self.region = region
         self.bare = 1.0 if bare is None else surface.interpolate(bare[:, None].astype(np.float32))
         self.hidden_variance = 0.0
-        if hidden is not None:
-            share = np.minimum(surface.interpolate(hidden[:, None]), MOST_HIDDEN)
-            self.hidden_variance = np.square(HIDING_SPREAD * share / (1.0 - share))
+        if self.seen is not None:
+            seen = np.maximum(self.seen[:, None], LEAST_SEEN)
+            self.hidden_variance = np.square(HIDING_SPREAD * (1.0 - seen) / seen)
 
     def _systematic(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """[T, 3] twice: variance of the log albedo that all frames of one light share, by the irradiance and by the
@@ -141,19 +143,16 @@ class TexturePass:
 
     def run(self, widths: tuple[float, ...]) -> tuple[TexelMaterial, dict]:
         """Both passes -> the material, and a record of what the held-out frames said to each pooling width."""
-        count = len(self.surface)
-        mean = np.full(count, self.specular, np.float32)
         fitted = np.nonzero(self.views.fitted)[0]
         some = fitted[spread_frames(len(fitted), FIRST_PASS_FRAMES, self.views.light_index[fitted])]
         fields = SmoothFields(self.surface.mesh, NEIGHBOUR_STEP, SURROUNDINGS_SPREAD, self.region)
-        first, _ = self._close(self._accumulate(None, some, "texture, first pass"), [mean], fields)[0]
+        first, _ = self._close(self._accumulate(None, some, "texture, first pass"), [self.specular], fields)[0]
         evidence = self._accumulate(first, fitted, "texture, second pass")
         pooled = [
             pooled_specular(self.surface, evidence.equations, width, mean=self.specular, sigma=self.sigma)
             for width in widths
         ]
-        if self.eyes is not None:
-            pooled = [self._with_eyes(intensity) for intensity in pooled]
+        pooled = [self._with_eyes(self.specular + self.shines * (intensity - self.specular)) for intensity in pooled]
         candidates, around = zip(*self._close(evidence, pooled, fields), strict=True)
         told = evidence.information.max(1)
         del evidence, fields  # a hundred bytes per texel that the frames to come need
@@ -296,9 +295,14 @@ class TexturePass:
 
     def _with_eyes(self, intensity: np.ndarray) -> np.ndarray:
         """Specular intensity [T] with the eyeballs' own."""
-        intensity = intensity.copy()
-        intensity[self.eyes.rows] = EYE_INTENSITY
+        if self.eyes is not None:
+            intensity = intensity.copy()
+            intensity[self.eyes.rows] = EYE_INTENSITY
         return intensity
+
+    def _at_texels(self, values: np.ndarray) -> np.ndarray:
+        """Vertex values [V] at the texels [T]."""
+        return self.surface.interpolate(values[:, None])[:, 0]
 
     def _round_eyes(self, rough: np.ndarray, information: np.ndarray) -> np.ndarray:
         """[E, 3] albedo of the eyeballs' texels as those at the same angle have it, of a result [T, 3]."""
@@ -343,19 +347,23 @@ class TexturePass:
         return usual + fields.through(means - usual, known, np.zeros(precision.shape[1]))
 
     def held_out_errors(self, candidates: list[TexelMaterial]) -> list[float]:
-        """Root mean square residual of each candidate on the held-out frames (linear, censored, weighted)."""
+        """Root mean square residual of each candidate on the held-out frames (linear, censored, weighted), where
+        nothing hangs before the head."""
         sums = np.zeros(1 + len(candidates))
         frames = self.progress(np.nonzero(~self.views.fitted)[0], "texture, held-out frames")
         for view in work_ahead(self.view, frames):
-            sums += sum(self._share_out(view, lambda lit: _squared_errors(candidates, lit)))
+            sums += sum(self._share_out(view, lambda lit: _squared_errors(candidates, lit, self.seen)))
         return [float(value) for value in np.sqrt(sums[1:] / max(3.0 * sums[0], 1e-9))]
 
 
-def _squared_errors(candidates: list[TexelMaterial], lit: LitSamples) -> np.ndarray:
-    """The samples' total weight and each candidate's sum of squared residuals."""
-    samples, sums = lit.samples, [lit.samples.weight.sum()]
+def _squared_errors(candidates: list[TexelMaterial], lit: LitSamples, seen: np.ndarray | None) -> np.ndarray:
+    """The samples' total weight and each candidate's sum of squared residuals; seen [T]: how much texels count, None:
+    all alike."""
+    samples = lit.samples
+    weight = samples.weight if seen is None else samples.weight * seen[samples.rows]
+    sums = [weight.sum()]
     for material in candidates:
         error = lit.model(material) - samples.colours
         error[is_inactive(samples.saturation, error)] = 0.0
-        sums.append((samples.weight[:, None] * np.minimum(error**2, 0.01)).sum())
+        sums.append((weight[:, None] * np.minimum(error**2, 0.01)).sum())
     return np.array(sums, float)

@@ -117,16 +117,15 @@ def solve_clip(
     eyes = None if views.gaze is None else TurningEyes.of(surface)
     eye_texels = None if eyes is None else EyeTexels(texels, viewer, eyes, surface.faces_of(LIDS))
     typical = np.median(solution.state.albedo, axis=0)
-    scalp, specular, hidden = scalp_of(surface), solution.state.specular, None
     materials = clip_materials(viewer, shading, views, surface, solution.state, context)
+    scalp, hidden, matt = scalp_of(surface), None, None
     if scalp is not None:
         hidden = hidden_places(viewer, surface, materials)
         matt = matt_share(viewer, surface, materials, hidden, scalp)
-        specular = (specular * (1.0 - texels.interpolate(matt[:, None])[:, 0])).astype(np.float32)
     texture = TexturePass(
-        texels, viewer, shading, views, specular=specular, typical_albedo=typical,
+        texels, viewer, shading, views, specular=solution.state.specular, typical_albedo=typical,
         light_weights=solution.light_weights, region=scalp, bare=surface.vertices_of(FACE_SKIN), hidden=hidden,
-        context=context, eyes=eye_texels,
+        matt=matt, context=context, eyes=eye_texels,
     )
     widths = settings.map_size * np.array(SPECULAR_WIDTHS if settings.appearance.specular else (np.inf,))
     material, texture_record = texture.run(widths)

@@ -178,16 +178,31 @@ def test_what_hangs_before_a_place_says_nothing_of_it():
             return super().irradiance(frame) * np.where(hair, 4.0, 1.0).astype(np.float32)
 
     surface, viewer, views = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh), plate_views(mesh, PlateShading(mesh))
-    uv, error, confidence = texel_uv(surface), [], []
+    uv, error, confidence, held_out = texel_uv(surface), [], [], []
     for hidden in (None, hair[:, 0].astype(float)):
         texture = TexturePass(surface, viewer, HairyPlate(mesh), views, SPECULAR, TYPICAL, hidden=hidden)
-        material, _ = texture.run((np.inf,))
+        material, record = texture.run((np.inf,))
+        held_out += record["held_out"].values()
         error.append(np.log(material.albedo / true_albedo(uv)).mean(1))
         confidence.append(make_maps(surface, material, 0.4)["confidence"].ravel()[surface.pixel])
     covered, beside = uv[:, 0] < 0.25, (np.abs(uv - [0.55, 0.5]) < [0.15, 0.45]).all(1)
+    assert held_out[1] < 0.03, "where hair hangs, held-out frames have nothing to say; 0.06 if they had"
     assert np.median(error[0][covered]) < -1.2 and np.abs(error[1][covered]).max() < 0.45
     assert np.abs(error[1][beside]).max() < 0.03
     assert confidence[1][covered].max() < 0.01 and np.median(confidence[1][beside]) > 0.8
+
+
+def test_matt_texels_stay_matt_whatever_the_clip_shows():
+    mesh = grid_plane(33, 80.0)
+    surface, viewer, shading = TexelSurface(mesh, MAP), SurfaceViewer.of(mesh), PlateShading(mesh)
+    views, uv = plate_views(mesh, shading), texel_uv(surface)
+    found = []
+    for matt in (None, 1.0 * (mesh.uvs[:, 0] < 0.3)):
+        texture = TexturePass(surface, viewer, shading, views, 0.5 * SPECULAR, TYPICAL, matt=matt)
+        found.append(texture.run((4.0,))[0].specular)
+    covered, beside = uv[:, 0] < 0.25, (np.abs(uv - [0.55, 0.5]) < [0.15, 0.4]).all(1)
+    assert found[0][covered].min() > 0.2 and found[1][covered].max() == 0.0
+    assert np.allclose(found[0][beside], found[1][beside], atol=0.02)
 
 
 def test_more_frames_mean_more_confidence():

@@ -58,9 +58,9 @@ def run_from_inputs(stage: str, out: Path, way: Kernel = OWN, repository: Path =
     return Run(measure(stage, folder), tuple(name for name in files if name != LOG), folder)
 
 
-def run_all(stages: Sequence[str], ways: Sequence[Kernel], out: Path, at_once: int) -> dict[tuple[str, str], Run]:
-    """{(stage, way's name): its run}; at_once stages run side by side. RuntimeError where one fails."""
-    pairs = [(stage, way) for way in ways for stage in stages]
+def run_all(pairs: Sequence[tuple[str, Kernel]], out: Path, at_once: int) -> dict[tuple[str, str], Run]:
+    """{(stage, way's name): its run} of pairs of a stage and a way; at_once run side by side. RuntimeError where one
+    fails."""
     with ThreadPoolExecutor(at_once) as pool:
         folders = [out / way.name.replace(" ", "_") / stage for stage, way in pairs]
         runs = pool.map(run_from_inputs, (stage for stage, _ in pairs), folders, (way for _, way in pairs))
@@ -145,7 +145,7 @@ def write(stages: Sequence[str], at_once: int) -> None:
     """Runs the stages in turn from what is kept of those before them, all ways, and rewrites their golden files."""
     for stage in stages:
         with tempfile.TemporaryDirectory() as scratch:
-            runs = run_all([stage], WAYS, Path(scratch), at_once)
+            runs = run_all([(stage, way) for way in WAYS], Path(scratch), at_once)
             of_stage = {way: run for (_, way), run in runs.items()}
             _warn_of_version(stage, of_stage[OWN.name].measures)
             write_golden(stage, of_stage)

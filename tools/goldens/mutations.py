@@ -41,7 +41,7 @@ MUTATIONS = (
     Mutation("tracks: robust weight", "track_landmarks", "shared/tracking/texture_tracks.py", "OUTLIER_SPREADS = 1.5",
              "OUTLIER_SPREADS = 1.575"),
     Mutation("adjustment: robust weight", "track_landmarks", "shared/tracking/first_poses.py", "\nLOSS = 2.0",
-             "\nLOSS = 2.1", quick=True),
+             "\nLOSS = 2.1"),
     Mutation("head fit: prior of codes", "track_landmarks", "shared/tracking/fit_head.py", "identity: float = 1.0",
              "identity: float = 1.05"),
     Mutation("adjustment: stopping bound", "track_landmarks", "shared/tracking/bundle.py", "LEAST_GAIN = 1e-4",
