@@ -50,7 +50,7 @@ def hidden_places(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray
     shown = materials / known[:, None]
 
     def share(label: int, inside: np.ndarray) -> float:
-        return float(np.average(shown[inside, label], weights=known[inside]))
+        return float((shown[inside, label] * known[inside]).sum() / max(known[inside].sum(), 1e-6))
 
     ears, neck, chin = (surface.vertices_of((name,)) for name in ("ears", "neck", "chin"))
     beard, collar = _ramp(share(HAIR, chin), *BEARD), _ramp(share(CLOTH, neck), *COLLAR)

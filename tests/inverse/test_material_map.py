@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.material_labels import CLOTH, HAIR, LABELS, SKIN, UNKNOWN
 from shared.inverse.material_map import hidden_places, material_image, matt_share
@@ -63,6 +64,12 @@ def test_cloth_is_a_collar_where_there_is_much_of_it():
 def test_nothing_is_hidden_where_skin_shows():
     surface, viewer = head()
     assert hidden_places(viewer, surface, all_of(surface, skin=0.7, unknown=0.3)).max() == 0.0
+
+
+def test_a_mesh_with_other_segments_hides_nothing():
+    surface, viewer = head()
+    other = Surface(surface.mesh, np.zeros(len(surface.mesh.faces), np.uint8), ("all",))
+    assert not hidden_places(viewer, other, all_of(surface, hair=1.0)).any()
 
 
 def test_hair_that_grows_is_matt_and_what_no_frame_shows_of_the_scalp_like_the_rest():
