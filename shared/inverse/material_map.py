@@ -46,17 +46,17 @@ def hidden_places(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray
     """[V] probability that frames show what hangs before a place, not the place: hair on ears that it covers and on the
     neck, but where a beard grows, and on a neck without a collar what looks like cloth. surface: the viewer's, with
     segments; materials [V, len(LABELS)]."""
-    known = np.maximum(1.0 - materials[:, UNKNOWN], 1e-6)
-    shown = materials / known[:, None]
+    known, shown = _shown(materials)
 
     def share(label: int, inside: np.ndarray) -> float:
         return float((shown[inside, label] * known[inside]).sum() / max(known[inside].sum(), 1e-6))
 
     ears, neck, chin = (surface.vertices_of((name,)) for name in ("ears", "neck", "chin"))
-    beard, collar = _ramp(share(HAIR, chin), *BEARD), _ramp(share(CLOTH, neck), *COLLAR)
+    beard, collar = _ramp(share(HAIR, chin), BEARD), _ramp(share(CLOTH, neck), COLLAR)
     right = surface.mesh.vertices[:, 0] < 0.0
-    covered = np.where(right, *(_ramp(share(HAIR, ears & side), *COVERED) for side in (right, ~right)))
-    hair = np.select([ears, neck], [covered, 1.0 - beard * _ramp(viewer.normals[:, 2], *FRONT_OF_NECK)])
+    right_covered, left_covered = _ramp(share(HAIR, ears & right), COVERED), _ramp(share(HAIR, ears & ~right), COVERED)
+    covered = np.where(right, right_covered, left_covered)
+    hair = np.select([ears, neck], [covered, 1.0 - beard * _ramp(viewer.normals[:, 2], FRONT_OF_NECK)])
     return hair * shown[:, HAIR] + (1.0 - collar) * neck * shown[:, CLOTH]
 
 
@@ -65,13 +65,19 @@ def matt_share(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray, h
     """[V] how much of a place is hair that grows there, whose highlights lie along its strands: the surface's own lobe
     would shine like plastic. What no frame shows continues the rest of scalp [V] bool, or of the skin. surface: the
     viewer's, with segments; materials [V, len(LABELS)]; hidden [V]: see hidden_places."""
-    known = 1.0 - materials[:, UNKNOWN]
-    shown = materials[:, HAIR] / np.maximum(known, 1e-6)
+    known, shown = _shown(materials)
     fields = SmoothFields(viewer.mesh, 1.0, FAR_EDGES, scalp)
-    share = fields.through(shown[:, None], FAR_EDGES * known[:, None], np.zeros(1))[:, 0]
+    share = fields.through(shown[:, HAIR, None], FAR_EDGES * known[:, None], np.zeros(1))[:, 0]
     return np.where(surface.vertices_of(("ears",)), 0.0, np.clip(share, 0.0, 1.0) * (1.0 - hidden))
 
 
-def _ramp(values, low: float, high: float):
-    """0 up to low, 1 from high on."""
+def _shown(materials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[V] how far each place is known, more than 0, and the materials [V, len(LABELS)] as shares of that."""
+    known = np.maximum(1.0 - materials[:, UNKNOWN], 1e-6)
+    return known, materials / known[:, None]
+
+
+def _ramp(values: np.ndarray | float, limits: tuple[float, float]) -> np.ndarray | float:
+    """0 up to the first limit, 1 from the second on; values [...]."""
+    low, high = limits
     return np.clip((values - low) / (high - low), 0.0, 1.0)
