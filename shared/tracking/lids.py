@@ -27,8 +27,10 @@ OTHER_EYE = 1.0 / 3.0
 """Lids move together: share that the other eye has in what is said of one."""
 UPPER, LOWER, CORNERS = slice(10, 15), slice(2, 7), (0, 8)
 """Of the lids' sixteen points: the middle of both margins, and the outer and inner corner."""
-SLACK = 0.15
-"""Of the way from open to shut: apertures of open eyes wander by that with the pose and the network's noise."""
+LATE, SLACK = 0.2, 0.25
+"""Of the way from shut to open: up to here lids are shut already, since the network sees them come down late, and open
+again early. Three synthetic clips that blink: on the way from there on, the eye is open by the square of it. Of the
+latter, from open on: apertures of open eyes wander by that with the pose and the network's noise."""
 ROUNDS, NOT_OPEN = 8, 0.8
 BIAS_PRIOR, LEAST_LEVEL = 0.3, 0.75
 """Ridge on what of the aperture may follow the pose, a share of the evidence, and the least that it may leave of it: a
@@ -77,9 +79,10 @@ def closures(openness: np.ndarray, shut: np.ndarray) -> np.ndarray:
     known = np.nonzero(np.isfinite(apart).all(1))[0]
     if not len(known):
         return np.zeros_like(openness)
-    way = np.clip((1.0 - _together(from_shut(apart[known])) - SLACK) / (1.0 - SLACK), 0.0, 1.0)
-    way[:, shut[known].all(0)] = 0.0
-    return np.stack([np.interp(np.arange(len(openness)), known, own) for own in way.T], axis=1)
+    aperture = np.square(np.clip((_together(from_shut(apart[known])) - LATE) / (1.0 - LATE), 0.0, 1.0))
+    closed = np.clip((1.0 - aperture - SLACK) / (1.0 - SLACK), 0.0, 1.0)
+    closed[:, shut[known].all(0)] = 0.0
+    return np.stack([np.interp(np.arange(len(openness)), known, own) for own in closed.T], axis=1)
 
 
 def _together(values: np.ndarray) -> np.ndarray:

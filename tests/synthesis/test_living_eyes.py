@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shared.geometry.eyeballs import Eyeball, eyeballs_of, fit_sphere, gaze_direction
+from shared.geometry.eyeballs import EYE_RADIUS_MM, Eyeball, eyeballs_of, fit_sphere, gaze_direction
 from shared.geometry.surface import Surface
 from shared.geometry.transforms import WORLD_FROM_CAMERA, camera_centres, rigid, rotation_from_vector
 from shared.io.arrays import load_arrays, read_json
@@ -61,14 +61,14 @@ def eyeballs(head: Head) -> tuple[Eyeball, Eyeball]:
     return eyeballs_of(Surface(head.mesh, head.face_segment, head.segment_names))
 
 
-def test_eyeballs_are_spheres_near_the_models(made):
+def test_eyeballs_are_spheres_of_adult_size_where_the_models_begin(made):
     head, eyes = made
     for ball, oval, centre in zip(eyeballs(head), eyeballs(random_head(head_model(1), SEED, False)), eyes.centres,
                                   strict=True):
         np.testing.assert_allclose(np.linalg.norm(head.mesh.vertices[ball.vertices] - centre, axis=1), eyes.radius)
-        assert abs(eyes.radius / oval.radius - 1.0) < RADIUS_SPREAD + 0.01
+        assert 0 < abs(eyes.radius / EYE_RADIUS_MM - 1.0) <= RADIUS_SPREAD
         assert np.abs(centre - oval.centre)[:2].max() < 1e-9
-        assert 0 < abs(centre[2] - oval.centre[2]) <= DEPTH_SPREAD_MM
+        assert 0 < abs((centre[2] + eyes.radius) - (oval.centre[2] + oval.radius)) <= DEPTH_SPREAD_MM
     sides = [eyes.face_side[ball.faces] for ball in eyeballs(head)]
     assert (sides[0] == 0).all() and (sides[1] == 1).all() and (eyes.face_side >= 0).sum() == sum(map(len, sides))
 
@@ -282,7 +282,7 @@ def test_a_living_subject_holds_its_truth(tmp_path):
     assert not shut[truth["gt_frames"]].any()
     assert read_json(tmp_path / "eyes" / "synthesis.json")["gaze"] == "camera"
     centre, radius = truth["eyeball_centres"], float(truth["eyeball_radius"])
-    assert centre.shape == (2, 3) and (centre[:, 0] < 0).tolist() == [True, False] and 14.0 < radius < 18.0
+    assert centre.shape == (2, 3) and (centre[:, 0] < 0).tolist() == [True, False] and 11.0 < radius < 13.0
 
 
 def test_eyes_that_cannot_move_are_refused(tmp_path, capsys):

@@ -1,7 +1,8 @@
 """Living eyes of the procedural head: eyeballs that are exact spheres, and lids that slide over them.
 
-The head model's eyeballs are slightly oval. A living eyeball is a sphere near theirs, of the seed's own size and depth,
-and the lids keep the distance from it that they had. Lids move along arcs about its centre, not along the straight
+The head model's eyeballs are slightly oval and a third too large. A living eyeball is a sphere as large as an adult's,
+whose front lies where theirs does, of the seed's own size and depth, and the lids keep the distance from it that they
+had. Lids move along arcs about its centre, not along the straight
 displacements of the model, which would cut into it; they are shut where they meet.
 """
 
@@ -11,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shared.geometry.eyeballs import SIDES, fit_sphere
+from shared.geometry.eyeballs import EYE_RADIUS_MM, SIDES, fit_sphere
 from shared.geometry.raycast import RayScene
 from shared.tracking.head_model import HeadModel
 from tools.synthesis.head import Head, random_head
 
 RADIUS_SPREAD, DEPTH_SPREAD_MM = 0.05, 0.5
-"""How far radius and depth of an eyeball go from the model's, to either side, evenly."""
+"""How far an eyeball's radius goes from an adult's, and its front from the model's, to either side, evenly."""
 KEPT_MM, FREE_MM = 3.0, 12.0
 """Skin so near an eyeball moves with its surface; skin so far from it stays where it is."""
 REACH_MM = 32.0
@@ -114,8 +115,8 @@ def living_head(model: HeadModel, seed: int) -> tuple[Head, LivingEyes]:
     size, depth = 1.0 + RADIUS_SPREAD * rng.uniform(-1, 1), DEPTH_SPREAD_MM * rng.uniform(-1, 1)
     eyes = head.face_segment == head.segment_names.index("eyes")
     oval = [_Oval.of(head, eyes, sign) for sign in (-1, 1)]
-    radius = size * float(np.mean([one.radius for one in oval]))
-    centres = np.stack([one.centre + [0.0, 0.0, depth] for one in oval])
+    radius = size * EYE_RADIUS_MM
+    centres = np.stack([one.centre + [0.0, 0.0, one.radius - radius + depth] for one in oval])
     rest, wide, shut = (_rounded(vertices, oval, centres, radius) for vertices in _lid_shapes(model, head))
     vertices = np.concatenate([rest, head.mesh.vertices[len(rest):]])
     head = replace(head, mesh=head.mesh.replace(vertices=vertices))
