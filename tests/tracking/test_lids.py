@@ -89,8 +89,8 @@ def test_openness_counts_from_what_shut_lids_read():
 
 
 def test_lids_are_shut_as_far_as_their_aperture_says():
-    """Open eyes that wander are open, a blink shuts all the way, and what reads as half open is rather shut: the network
-    sees lids come down late, so that of the way 0.5 it is 1 - 0.375^2, but for the slack of a quarter."""
+    """Open eyes that wander are open, a blink shuts all the way, and what reads as half open is rather shut: lids come
+    down before the network sees it, so that of the way 0.5 it is 1 - 0.375^2, but for the slack of a quarter."""
     openness = np.array([1.0, 1.1, 0.95, 0.55, 0.1, 0.25, 0.55, 1.0])[:, None] * np.ones(2)
     half = (1.0 - 0.375**2 - 0.25) / 0.75
     expected = np.array([0.0, 0.0, 0.0, half, 1.0, 1.0, half, 0.0])[:, None] * np.ones(2)
