@@ -1,13 +1,14 @@
 """A mesh with fewer faces: vertices are taken away one by one, each drawn into a neighbour, the least harmful first.
 
-What stays is a part of the mesh: each vertex keeps its number and its UVs, so that blend shapes, normals and segments
-are looked up and not made anew, and the two sides of a seam share their vertices as before.
+What stays is a part of the mesh: vertices and UVs keep their numbers, so that blend shapes, normals and segments are
+looked up and not made anew, and the two sides of a seam share their vertices as before.
 
 Harm is measured in five dimensions, places and UVs in mm, by quadrics: squared distances from the planes of all faces
 that a vertex stands for [Garland1998], for each side of a seam by itself [Hoppe1999]. Along lines that must stay, which
 are borders, seams and the edges of lips and lids, distances from the lines count too, and a vertex goes along its line
 only. No face turns over, in space or in the map, and the surface stays a manifold. In the end the vertices move by
-hundredths of a mm along their normals: faces between points of a round surface lie below it, moved ones about it.
+hundredths of a mm along their normals: faces between points of a round surface lie below it, moved ones about it. UVs
+beside seams and borders move likewise, so that faces show what the whole surface shows there.
 """
 
 from __future__ import annotations
@@ -22,7 +23,15 @@ import scipy.sparse as sparse
 from shared.compute.compiled import compiled, compiled_part
 from shared.compute.sparse_solve import factorised
 from shared.geometry.eyeballs import Eyeball
-from shared.geometry.mesh import Mesh, face_normals, mesh_edges, normalised, unique_pairs, vertex_normals
+from shared.geometry.mesh import (
+    Mesh,
+    face_normals,
+    interpolate,
+    mesh_edges,
+    normalised,
+    unique_pairs,
+    vertex_normals,
+)
 from shared.geometry.raycast import RAY_START_MM, RayScene
 from shared.geometry.surface import Surface
 
@@ -36,6 +45,8 @@ STEEPEST_TURN = 0.3
 """Cosine of the angle by which a face may turn at once."""
 FARTHEST_MM, STIFFNESS = 1.0, 0.15
 """Where faces are moved nearer to the surface: beyond it they are of something else; share by which moves count."""
+UV_FARTHEST_MM, UV_STIFFNESS = 3.0, 0.02
+"""The same of the map."""
 _PLACES = ((0.6, 0.2, 0.2), (0.2, 0.6, 0.2), (0.2, 0.2, 0.6), (0.45, 0.45, 0.1), (0.1, 0.45, 0.45), (0.45, 0.1, 0.45))
 """Corner weights of the points on a face where its distance is measured."""
 SLIMMEST = 0.05
@@ -54,8 +65,8 @@ _TERMS = 21
 
 @dataclass(frozen=True, eq=False)
 class ReducedMesh:
-    """mesh: few faces over the whole mesh's vertices, which keep their numbers whether used or not, and over its UVs;
-    faces [n] int, in order: the faces of the whole mesh that are left, with their segments and other vertices."""
+    """mesh: few faces over the whole mesh's vertices and UVs, which keep their numbers whether used or not; faces [n]
+    int, in order: the faces of the whole mesh that are left, with their segments and other vertices."""
 
     mesh: Mesh
     faces: np.ndarray
@@ -89,7 +100,7 @@ def reduced(surface: Surface, wanted: Sequence[int]) -> tuple[ReducedMesh, ...]:
         _collapse(faces, wedges, labels[left], alive, kinds, spots, quadrics, count)
         faces, wedges, left = faces[alive], wedges[alive], left[alive]
         few = mesh.replace(faces=faces.astype(mesh.faces.dtype), face_uvs=pairs[wedges, 1].astype(mesh.face_uvs.dtype))
-        found.append(ReducedMesh(_nearer(few, mesh) if len(left) < len(mesh.faces) else mesh, left))
+        found.append(ReducedMesh(_fitted(few, mesh, kinds) if len(left) < len(mesh.faces) else mesh, left))
     return tuple(found)
 
 
@@ -161,42 +172,78 @@ def _terms(point: np.ndarray, tangents: tuple[np.ndarray, ...]) -> np.ndarray:
     return np.column_stack([matrix[:, *np.triu_indices(5)], slope, -(slope * point).sum(1)])
 
 
-def _nearer(few: Mesh, whole: Mesh) -> Mesh:
-    """few with its vertices moved along the whole surface's normals to where its faces are nearest to that surface, by
-    least squares over points on them."""
+def _fitted(few: Mesh, whole: Mesh, kinds: np.ndarray) -> Mesh:
+    """few with its vertices moved along the whole surface's normals to where its faces are nearest to that surface, and
+    its UVs to where these show what it shows there, by least squares over points on them. kinds [V]: see _lines; UVs of
+    seams and borders stay."""
     bary, normals = np.array(_PLACES), face_normals(few.vertices, few.faces)
     area, normals = np.linalg.norm(normals, axis=1), normalised(normals)
     points = np.einsum("pk,fki->fpi", bary, few.vertices[few.faces]).reshape(-1, 3)
-    distance = _distance_along(whole, points, np.repeat(normals, len(bary), axis=0))
+    distance, uvs = _met_along(whole, points, np.repeat(normals, len(bary), axis=0))
     known = np.nonzero(np.abs(distance) < FARTHEST_MM)[0]
     face, place = np.divmod(known, len(bary))
     directions = vertex_normals(whole.vertices, whole.faces)
     # How far a point goes along its face's normal when a corner goes along its own.
     effect = bary[place] * (directions[few.faces[face]] * normals[face][:, None]).sum(-1)
-    used, column = np.unique(few.faces, return_inverse=True)
-    rows, columns = np.repeat(np.arange(len(known)), 3), column.reshape(-1, 3)[face].ravel()
-    system = sparse.coo_matrix((effect.ravel(), (rows, columns)), shape=(len(known), len(used))).tocsr()
-    weighted = system.T @ sparse.diags(area[face])
+    along = _least_squares(few.faces[face], effect, distance[known, None], area[face], STIFFNESS, len(whole.vertices))
+    aside = uvs[known] - np.einsum("nk,nki->ni", bary[place], few.uvs[few.face_uvs[face]])
+    near = np.linalg.norm(aside, axis=1) * _mm_per_uv(whole) < UV_WEIGHT * UV_FARTHEST_MM
+    face, place, aside = face[near], place[near], aside[near]
+    stays = np.zeros(len(few.uvs), bool)
+    stays[few.face_uvs] = kinds[few.faces] & ~_OUTLINE != 0
+    corners = few.face_uvs[face]
+    moves = _least_squares(corners, bary[place] * ~stays[corners], aside, area[face], UV_STIFFNESS, len(few.uvs))
+    uvs = _without_turns(few, np.clip(few.uvs + moves, 0.0, 1.0))
+    return few.replace(vertices=whole.vertices + along * directions, uvs=uvs)
+
+
+def _without_turns(mesh: Mesh, uvs: np.ndarray) -> np.ndarray:
+    """UVs [T, 2] in place of a mesh's own, which stay where a face would turn over in the map."""
+    uvs, before = uvs.copy(), _areas(mesh.uvs[mesh.face_uvs])
+    while True:
+        turned = mesh.face_uvs[_areas(uvs[mesh.face_uvs]) * before < np.square(STEEPEST_TURN * before)]
+        if np.array_equal(uvs[turned], mesh.uvs[turned]):
+            return uvs
+        uvs[turned] = mesh.uvs[turned]
+
+
+def _areas(corners: np.ndarray) -> np.ndarray:
+    """[F] twice the signed areas of triangles [F, 3, 2]."""
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _least_squares(
+    corners: np.ndarray, effect: np.ndarray, wanted: np.ndarray, weight: np.ndarray, stiffness: float, count: int
+) -> np.ndarray:
+    """[count, C] what each of count corners adds, so that at N points, of corners [N, 3] by their effect [N, 3], the
+    sum is near what is wanted [N, C], of some weight [N]; small by the stiffness, a share of a corner's mean weight."""
+    used, column = np.unique(corners, return_inverse=True)
+    rows = np.repeat(np.arange(len(corners)), 3)
+    system = sparse.coo_matrix((effect.ravel(), (rows, column.ravel())), shape=(len(corners), len(used))).tocsr()
+    weighted = system.T @ sparse.diags(weight)
     normal = (weighted @ system).tocsc()
-    stiff = normal + sparse.diags(np.full(len(used), STIFFNESS * normal.diagonal().mean()))
-    vertices = np.array(whole.vertices, np.float64)
-    vertices[used] += factorised(stiff).solve(weighted @ distance[known])[:, None] * directions[used]
-    return few.replace(vertices=vertices)
+    found = np.zeros((count, wanted.shape[1]))
+    if effect.any():
+        stiff = normal + sparse.diags(np.full(len(used), stiffness * normal.diagonal().mean()))
+        found[used] = factorised(stiff).solve(weighted @ wanted)
+    return found
 
 
-def _distance_along(whole: Mesh, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def _met_along(whole: Mesh, points: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[N] mm from points [N, 3] to the surface along directions [N, 3], below 0 against them, whichever is nearer among
-    faces that face the same way; infinite where there is none."""
+    faces that face the same way; infinite where there is none. UVs [N, 2] there."""
     scene, facing = RayScene(whole.vertices, whole.faces), face_normals(whole.vertices, whole.faces)
-    found = np.full(len(points), np.inf)
+    found, uvs = np.full(len(points), np.inf), np.zeros((len(points), 2))
     for sign in (1.0, -1.0):
-        face, _, distance = scene.intersect(points - sign * RAY_START_MM * directions, sign * directions)
+        face, bary, distance = scene.intersect(points - sign * RAY_START_MM * directions, sign * directions)
         hit = np.nonzero(face >= 0)[0]
         hit = hit[(facing[face[hit]] * directions[hit]).sum(1) > 0.0]
         signed = sign * (distance[hit].astype(np.float64) - RAY_START_MM)
         nearer = np.abs(signed) < np.abs(found[hit])
-        found[hit[nearer]] = signed[nearer]
-    return found
+        hit = hit[nearer]
+        found[hit], uvs[hit] = signed[nearer], interpolate(whole.uvs, whole.face_uvs, face[hit], bary[hit])
+    return found, uvs
 
 
 @compiled_part

@@ -47,12 +47,12 @@ def distances(pymeshlab, source, target):
 def test_as_many_faces_as_wanted(head, heads):
     for found, wanted in zip(heads, WANTED, strict=True):
         assert wanted - 2 < len(found.mesh.faces) <= wanted and len(found.faces) == len(found.mesh.faces)
-        assert found.mesh.uvs is head.mesh.uvs and found.mesh.vertices.shape == head.mesh.vertices.shape
+        assert found.mesh.uvs.shape == head.mesh.uvs.shape and found.mesh.vertices.shape == head.mesh.vertices.shape
 
 
 def test_the_same_bits_again(head, heads):
     for one, other in zip(heads, reduced(head, WANTED), strict=True):
-        for name in ("vertices", "faces", "face_uvs"):
+        for name in ("vertices", "faces", "uvs", "face_uvs"):
             np.testing.assert_array_equal(getattr(one.mesh, name), getattr(other.mesh, name))
         np.testing.assert_array_equal(one.faces, other.faces)
 
@@ -112,16 +112,31 @@ def seen_uvs(mesh, yaw_deg):
     return uvs
 
 
+def texture_off_mm(mesh, whole, yaw_deg):
+    """[n] how far beside each other, on the whole mesh, both show their texture to a camera."""
+    flat = np.column_stack([whole.uvs, np.zeros(len(whole.uvs))])
+    areas = [np.linalg.norm(face_normals(*each), axis=1).sum()
+             for each in ((whole.vertices, whole.faces), (flat, whole.face_uvs))]
+    off = np.linalg.norm(seen_uvs(mesh, yaw_deg) - seen_uvs(whole, yaw_deg), axis=-1)
+    return off[np.isfinite(off)] * np.sqrt(areas[0] / areas[1])
+
+
+@pytest.mark.parametrize(("which", "most_left"), [(0, 0.95), (1, 0.9)])
+def test_uvs_are_fitted_and_those_of_seams_stay(head, heads, which, most_left):
+    mesh = heads[which].mesh
+    before, after = (texture_off_mm(each, head.mesh, 0.0) for each in (mesh.replace(uvs=head.mesh.uvs), mesh))
+    assert np.mean(after[after < 20.0]) < most_left * np.mean(before[before < 20.0])
+    seam = np.unique(line_edges(head, head.mesh.faces, head.mesh.face_uvs, head.face_segment, "seam"))
+    own = head.mesh.face_uvs[np.isin(head.mesh.faces, seam)]
+    np.testing.assert_array_equal(mesh.uvs[own], head.mesh.uvs[own])
+    assert (mesh.uvs != head.mesh.uvs).any(1).mean() > 0.1
+
+
 @pytest.mark.parametrize("yaw_deg", [-60.0, 0.0, 60.0])
 @pytest.mark.parametrize(("which", "largest_mm"), [(0, 0.25), (1, 1.3)])
 def test_the_texture_stays_where_it_was(head, heads, which, largest_mm, yaw_deg):
     """From the front and from the sides, where both show the same island of the map."""
-    mesh = head.mesh
-    flat = np.column_stack([mesh.uvs, np.zeros(len(mesh.uvs))])
-    areas = [np.linalg.norm(face_normals(*each), axis=1).sum()
-             for each in ((mesh.vertices, mesh.faces), (flat, mesh.face_uvs))]
-    off = np.linalg.norm(seen_uvs(heads[which].mesh, yaw_deg) - seen_uvs(mesh, yaw_deg), axis=-1)
-    off_mm = off[np.isfinite(off)] * np.sqrt(areas[0] / areas[1])
+    off_mm = texture_off_mm(heads[which].mesh, head.mesh, yaw_deg)
     assert len(off_mm) > 3000 and np.median(off_mm) < 0.35 * largest_mm
     assert np.percentile(off_mm[off_mm < 20.0], 95) < largest_mm and (off_mm > 20.0).mean() < 0.01
 
