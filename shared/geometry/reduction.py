@@ -45,8 +45,8 @@ STEEPEST_TURN = 0.3
 """Cosine of the angle by which a face may turn at once."""
 FARTHEST_MM, STIFFNESS = 1.0, 0.15
 """Where faces are moved nearer to the surface: beyond it they are of something else; share by which moves count."""
-UV_FARTHEST_MM, UV_STIFFNESS = 3.0, 0.02
-"""The same of the map."""
+UV_FARTHEST_MM, UV_STIFFNESS, LEAST_AREA = 3.0, 0.02, 0.1
+"""The same of the map, and the share of its area there that a face keeps at least."""
 _PLACES = ((0.6, 0.2, 0.2), (0.2, 0.6, 0.2), (0.2, 0.2, 0.6), (0.45, 0.45, 0.1), (0.1, 0.45, 0.45), (0.45, 0.1, 0.45))
 """Corner weights of the points on a face where its distance is measured."""
 SLIMMEST = 0.05
@@ -198,10 +198,10 @@ def _fitted(few: Mesh, whole: Mesh, kinds: np.ndarray) -> Mesh:
 
 
 def _without_turns(mesh: Mesh, uvs: np.ndarray) -> np.ndarray:
-    """UVs [T, 2] in place of a mesh's own, which stay where a face would turn over in the map."""
+    """UVs [T, 2] in place of a mesh's own, which stay where a face would turn over in the map or lose its area."""
     uvs, before = uvs.copy(), _areas(mesh.uvs[mesh.face_uvs])
     while True:
-        turned = mesh.face_uvs[_areas(uvs[mesh.face_uvs]) * before < np.square(STEEPEST_TURN * before)]
+        turned = mesh.face_uvs[_areas(uvs[mesh.face_uvs]) * before < LEAST_AREA * np.square(before)]
         if np.array_equal(uvs[turned], mesh.uvs[turned]):
             return uvs
         uvs[turned] = mesh.uvs[turned]
