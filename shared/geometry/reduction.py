@@ -48,7 +48,7 @@ FARTHEST_MM, STIFFNESS = 1.0, 0.15
 UV_FARTHEST_MM, UV_STIFFNESS, LEAST_AREA = 3.0, 0.02, 0.1
 """The same of the map, and the share of its area there that a face keeps at least."""
 _PLACES = ((0.6, 0.2, 0.2), (0.2, 0.6, 0.2), (0.2, 0.2, 0.6), (0.45, 0.45, 0.1), (0.1, 0.45, 0.45), (0.45, 0.1, 0.45))
-"""Corner weights of the points on a face where its distance is measured."""
+"""Corner weights of the points on a face where its distance is measured, and what it shows."""
 SLIMMEST = 0.05
 """Twice a face's area over the sum of its squared sides, below which it does not get slimmer: 0.58 is equilateral."""
 _FACE = ("forehead", "brows", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "chin", "jaw")
@@ -87,7 +87,8 @@ def reduced(surface: Surface, wanted: Sequence[int]) -> tuple[ReducedMesh, ...]:
         labels = np.where(surface.faces_of(OUTLINED), 1 + surface.face_segment.astype(np.int64), 0)
     pairs, wedges, _ = unique_pairs(np.column_stack([mesh.faces.ravel(), mesh.face_uvs.ravel()]))
     wedges = wedges.reshape(-1, 3)
-    spots = np.column_stack([mesh.vertices[pairs[:, 0]], _mm_per_uv(mesh) * mesh.uvs[pairs[:, 1]]])
+    mm_per_uv = _mm_per_uv(mesh)
+    spots = np.column_stack([mesh.vertices[pairs[:, 0]], UV_WEIGHT * mm_per_uv * mesh.uvs[pairs[:, 1]]])
     spots = np.ascontiguousarray(spots, np.float64)
     lines, kinds = _lines(mesh, wedges, labels)
     weight = np.ones(len(labels))
@@ -100,16 +101,20 @@ def reduced(surface: Surface, wanted: Sequence[int]) -> tuple[ReducedMesh, ...]:
         _collapse(faces, wedges, labels[left], alive, kinds, spots, quadrics, count)
         faces, wedges, left = faces[alive], wedges[alive], left[alive]
         few = mesh.replace(faces=faces.astype(mesh.faces.dtype), face_uvs=pairs[wedges, 1].astype(mesh.face_uvs.dtype))
-        found.append(ReducedMesh(_fitted(few, mesh, kinds) if len(left) < len(mesh.faces) else mesh, left))
+        found.append(ReducedMesh(_fitted(few, mesh, kinds, mm_per_uv) if len(left) < len(mesh.faces) else mesh, left))
     return tuple(found)
 
 
 def _mm_per_uv(mesh: Mesh) -> float:
-    """What one unit of UV counts as: on average its length on the surface, times UV_WEIGHT."""
-    flat = np.column_stack([mesh.uvs, np.zeros(len(mesh.uvs))])
-    area, uv_area = (np.linalg.norm(face_normals(*each), axis=1).sum()
-                     for each in ((mesh.vertices, mesh.faces), (flat, mesh.face_uvs)))
-    return UV_WEIGHT * float(np.sqrt(area / uv_area)) if uv_area > 0.0 else 0.0
+    """Length of one unit of UV on the surface, on average."""
+    area = np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1).sum()
+    uv_area = np.abs(_map_areas(mesh.uvs, mesh.face_uvs)).sum()
+    return float(np.sqrt(area / uv_area)) if uv_area > 0.0 else 0.0
+
+
+def _map_areas(uvs: np.ndarray, face_uvs: np.ndarray) -> np.ndarray:
+    """[F] twice the areas of faces in the map, below 0 where they are mirrored there."""
+    return face_normals(np.column_stack([uvs, np.zeros(len(uvs))]), face_uvs)[:, 2]
 
 
 def _lines(mesh: Mesh, wedges: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -172,7 +177,7 @@ def _terms(point: np.ndarray, tangents: tuple[np.ndarray, ...]) -> np.ndarray:
     return np.column_stack([matrix[:, *np.triu_indices(5)], slope, -(slope * point).sum(1)])
 
 
-def _fitted(few: Mesh, whole: Mesh, kinds: np.ndarray) -> Mesh:
+def _fitted(few: Mesh, whole: Mesh, kinds: np.ndarray, mm_per_uv: float) -> Mesh:
     """few with its vertices moved along the whole surface's normals to where its faces are nearest to that surface, and
     its UVs to where these show what it shows there, by least squares over points on them. kinds [V]: see _lines; UVs of
     seams and borders stay."""
@@ -186,8 +191,8 @@ def _fitted(few: Mesh, whole: Mesh, kinds: np.ndarray) -> Mesh:
     # How far a point goes along its face's normal when a corner goes along its own.
     effect = bary[place] * (directions[few.faces[face]] * normals[face][:, None]).sum(-1)
     along = _least_squares(few.faces[face], effect, distance[known, None], area[face], STIFFNESS, len(whole.vertices))
-    aside = uvs[known] - np.einsum("nk,nki->ni", bary[place], few.uvs[few.face_uvs[face]])
-    near = np.linalg.norm(aside, axis=1) * _mm_per_uv(whole) < UV_WEIGHT * UV_FARTHEST_MM
+    aside = uvs[known] - interpolate(few.uvs, few.face_uvs, face, bary[place])
+    near = mm_per_uv * np.linalg.norm(aside, axis=1) < UV_FARTHEST_MM
     face, place, aside = face[near], place[near], aside[near]
     stays = np.zeros(len(few.uvs), bool)
     stays[few.face_uvs] = kinds[few.faces] & ~_OUTLINE != 0
@@ -199,18 +204,12 @@ def _fitted(few: Mesh, whole: Mesh, kinds: np.ndarray) -> Mesh:
 
 def _without_turns(mesh: Mesh, uvs: np.ndarray) -> np.ndarray:
     """UVs [T, 2] in place of a mesh's own, which stay where a face would turn over in the map or lose its area."""
-    uvs, before = uvs.copy(), _areas(mesh.uvs[mesh.face_uvs])
+    uvs, before = uvs.copy(), _map_areas(mesh.uvs, mesh.face_uvs)
     while True:
-        turned = mesh.face_uvs[_areas(uvs[mesh.face_uvs]) * before < LEAST_AREA * np.square(before)]
+        turned = mesh.face_uvs[_map_areas(uvs, mesh.face_uvs) * before < LEAST_AREA * np.square(before)]
         if np.array_equal(uvs[turned], mesh.uvs[turned]):
             return uvs
         uvs[turned] = mesh.uvs[turned]
-
-
-def _areas(corners: np.ndarray) -> np.ndarray:
-    """[F] twice the signed areas of triangles [F, 3, 2]."""
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _least_squares(

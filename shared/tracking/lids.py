@@ -91,13 +91,6 @@ def _together(values: np.ndarray) -> np.ndarray:
     return (1.0 - OTHER_EYE) * values + OTHER_EYE * other
 
 
-def half_closed(openness: np.ndarray) -> float:
-    """What the openness [F, 2] of lids is, some of them NaN, when they are half closed."""
-    lowest = float(np.nanmin(openness)) if np.isfinite(openness).any() else 1.0
-    reads = SHUT_READS[0] if lowest > SHUT_READS[1] else max(lowest, SHUT_READS[0])
-    return 0.5 * (1.0 + reads)
-
-
 def lid_apertures(
     lids_px: np.ndarray, centres: np.ndarray, camera_from_head: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -115,10 +115,10 @@ def seen_uvs(mesh, yaw_deg):
 def texture_off_mm(mesh, whole, yaw_deg):
     """[n] how far beside each other, on the whole mesh, both show their texture to a camera."""
     flat = np.column_stack([whole.uvs, np.zeros(len(whole.uvs))])
-    areas = [np.linalg.norm(face_normals(*each), axis=1).sum()
-             for each in ((whole.vertices, whole.faces), (flat, whole.face_uvs))]
+    area, uv_area = (np.linalg.norm(face_normals(places, faces), axis=1).sum()
+                     for places, faces in ((whole.vertices, whole.faces), (flat, whole.face_uvs)))
     off = np.linalg.norm(seen_uvs(mesh, yaw_deg) - seen_uvs(whole, yaw_deg), axis=-1)
-    return off[np.isfinite(off)] * np.sqrt(areas[0] / areas[1])
+    return off[np.isfinite(off)] * np.sqrt(area / uv_area)
 
 
 @pytest.mark.parametrize(("which", "most_left"), [(0, 0.95), (1, 0.9)])

@@ -2,8 +2,8 @@
 
 The head model's eyeballs are slightly oval and a third too large. A living eyeball is a sphere as large as an adult's,
 whose front lies where theirs does, of the seed's own size and depth, and the lids keep the distance from it that they
-had. Lids move along arcs about its centre, not along the straight
-displacements of the model, which would cut into it; they are shut where they meet.
+had. Lids move along arcs about its centre, not along the straight displacements of the model, which would cut into it;
+they are shut where they meet.
 """
 
 from __future__ import annotations
