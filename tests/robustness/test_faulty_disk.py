@@ -3,68 +3,60 @@
 The same at the real stages' writes, those of the native libraries, too: python tests/robustness/fault_matrix.py writes.
 """
 
-import contextlib
 import errno
 import hashlib
+import json
 import os
 import shutil
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
-from faulty_files import KINDS, FaultyDisk
+from faulty_files import KINDS
 from slow import SLOW
-from toy_runs import READ_TEXT, make_subject
+from toy_runs import REPOSITORY, make_subject
 
-from shared.contract import main
 from shared.contract.disk import disk_fault
 from shared.contract.folders import RunFolder
 from shared.contract.hashing import HashMemory
 from shared.contract.manifest import damage, read_manifest
 
 EVERY = 1 if SLOW else 4
-"""Of the stage's writes one in so many is disturbed: a process forked from a large one takes its time."""
+"""Of the stage's writes one in so many is disturbed."""
 
 OUTCOMES = {"full": (0, 2), "io": (0, 1, 2), "kill": (-9,)}
 
 
-def write_all(job):
-    """A stage with several files, one in a folder, one volatile."""
-    (job.out / "text.txt").write_text(f"{job.subject.video.read_text()} {job.params.as_dict()}")
-    (job.out / "lines").mkdir()
-    for number in range(2):
-        with open(job.out / "lines" / f"{number:03d}.txt", "w") as file:
-            file.write("one line\n")
-    (job.out / "when.json").write_text("{}")
+@pytest.fixture(scope="module")
+def forks():
+    """The process that forks for each case."""
+    paths = os.pathsep.join(map(str, (REPOSITORY, Path(__file__).parents[1] / "helpers")))
+    with subprocess.Popen([sys.executable, Path(__file__).with_name("forked_stage.py")], text=True,
+                          env=os.environ | {"PYTHONPATH": paths}, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as own:
+        yield own
+        own.stdin.close()
+    assert own.returncode == 0
 
 
 class Bench:
-    """The stage in processes of its own, forked so that a case takes hundredths of a second."""
+    """The stage in processes of its own."""
 
-    def __init__(self, folder):
-        self.folder, self.subject = folder, make_subject(folder / "anna")
-        self.pipeline = folder / "pipeline.yaml"
+    def __init__(self, folder, forks):
+        self.folder, self.forks, self.exchanges = folder, forks, True
+        self.subject, self.pipeline = make_subject(folder / "anna"), folder / "pipeline.yaml"
         self.pipeline.write_text("stages:\n  read_text: {}\n")
         self.published = self.subject / "work" / "read_text"
 
     def call(self, size, kind="", at=0):
         """-> exit code, what it said, and the writes that it came to."""
         said, counted = self.folder / "said.txt", self.folder / "counted.txt"
-        child = os.fork()
-        if child == 0:
-            with open(said, "w") as file, contextlib.redirect_stderr(file):
-                disk = FaultyDisk(self.subject, kind, at)
-                disk.install()
-                code = 70
-                try:
-                    code = main(READ_TEXT, write_all, None, ["--subject", str(self.subject), "--pipeline",
-                                                             str(self.pipeline), "--set", f"size={size}"])
-                except BaseException as error:  # nothing of the child may reach the test runner
-                    sys.stderr.write(f"Traceback: {error!r}\n")
-                counted.write_text(str(disk.count))
-                sys.stderr.flush()
-                os._exit(code)
-        _, status = os.waitpid(child, 0)
-        return os.waitstatus_to_exitcode(status), said.read_text(), int(counted.read_text()) if kind == "" else 0
+        case = {"subject": str(self.subject), "pipeline": str(self.pipeline), "size": size, "kind": kind, "at": at,
+                "exchanges": self.exchanges, "said": str(said), "counted": str(counted)}
+        self.forks.stdin.write(json.dumps(case) + "\n")
+        self.forks.stdin.flush()
+        code = int(self.forks.stdout.readline())
+        return code, said.read_text(), int(counted.read_text()) if kind == "" else 0
 
     def result(self):
         """{file: SHA-256} of what is published, None where nothing is; fails where it is not whole."""
@@ -95,13 +87,14 @@ def test_reasons_that_libraries_give_in_words_are_understood(tmp_path, number, h
 
 @pytest.mark.parametrize("before", ["nothing", "earlier result", "earlier result, no exchange"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_old_result_or_new_one_never_a_third(tmp_path, monkeypatch, kind, before):
-    bench, backup = Bench(tmp_path), tmp_path / "backup"
+def test_old_result_or_new_one_never_a_third(tmp_path, monkeypatch, forks, kind, before):
+    bench, backup = Bench(tmp_path, forks), tmp_path / "backup"
     if before != "nothing":
         assert bench.call(3)[0] == 0
         shutil.copytree(bench.subject / "work", backup)
     if before.endswith("no exchange"):  # as on NFS: a kill between two renames is mended by whoever comes next
         monkeypatch.setattr("shared.contract.folders.exchange", lambda one, other: False)
+        bench.exchanges = False
     old = bench.result()
     code, said, writes = bench.call(4)
     new = bench.result()
