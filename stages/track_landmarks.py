@@ -7,7 +7,7 @@ Method   468 landmarks a frame start the poses, dense flow and then tracks again
          one rigid body, hold them still; the head model is fitted to the tracks and then bent to them freely, its lids
          laid on those of the frames. Its size
          is the head model's mean and what the irises say, or that of a given length. Frames of another expression than
-         most are left out. Irises and lids of each frame tell gaze and blinks.
+         most are left out. Irises, followed by their texture, and lids of each frame tell gaze and blinks.
 Fails    no landmarks in three frames; skin that cannot be tracked (too small, blurred, or not the same head); a head
          that does not turn (a poster, too).
 """
@@ -22,7 +22,7 @@ from shared.contract.records import LANDMARKS, MESH, TRACKED_POSES, TRACKING, TR
 
 STAGE = Stage(
     name="track_landmarks",
-    version=16,
+    version=17,
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
     given=("landmarks", "poses"),
@@ -211,19 +211,18 @@ def size_head(job: Job, frames, model, kept: np.ndarray, seen, track, fits: np.n
     lens [3, 3]."""
     from shared.tracking.eyes import head_scale, track_eyes
 
-    def measured(track):
+    def measured(track, seen):
         surface = model.surface(track.fit.vertices)
         if seen is None:
             return surface, None
-        poses = track.camera_from_head[fits]
-        return surface, track_eyes(surface, seen.subset(kept), poses, lens, frames.time_s[kept])
+        return surface, track_eyes(surface, seen, track.camera_from_head[fits], lens, frames.time_s[kept])
 
-    surface, eyes = measured(track)
+    surface, eyes = measured(track, None if seen is None else seen.subset(kept))
     scale = head_scale(surface, eyes, job.subject.pupil_distance_mm)
     job.note(f"size: {100 * (scale.factor - 1):+.1f} % (deviation {100 * scale.log_deviation:.1f} %) by {scale.method}")
     if scale.factor != 1.0:
         track = track.scaled(scale.factor)
-        surface, eyes = measured(track)
+        surface, eyes = measured(track, None if eyes is None else eyes.seen)
     return track, surface, eyes, scale
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from shared.capture.landmarks import EYE_CORNERS_LEFT, EYE_CORNERS_RIGHT, crop_under, load_network, run_network
@@ -21,6 +22,8 @@ EYE_SIZE = 64
 EYE_ENLARGEMENT = 2.3
 LEAST_WIDTH_PX = 6.0
 """Between the corners of an eye: what is seen from so far to the side, or so small, shows no iris."""
+BESIDE_LIDS_PX = 4
+"""Kept of the picture around an eye's lids."""
 
 CONTOUR_COUNT, LID_COUNT = 71, 16
 LOWER_LID, UPPER_LID = tuple(range(9)), (0, 9, 10, 11, 12, 13, 14, 15, 8)
@@ -33,35 +36,56 @@ FACE_MESH_LIDS = (
 """The same points among the 468 landmarks of the face, of the right and the left eye."""
 
 
+class EyePicture(NamedTuple):
+    """grey [h, w] uint8 of what lies about an eye's lids; corner [2] px: where it begins in the picture."""
+
+    grey: np.ndarray
+    corner: np.ndarray
+
+    @classmethod
+    def of(cls, rgb: np.ndarray, lids_px: np.ndarray) -> EyePicture:
+        """Cut from rgb [H, W, 3] uint8 about lids_px [16, 2] px."""
+        height, width = rgb.shape[:2]
+        first = np.clip(np.floor(lids_px.min(0)).astype(int) - BESIDE_LIDS_PX, 0, (width - 1, height - 1))
+        last = np.clip(np.ceil(lids_px.max(0)).astype(int) + BESIDE_LIDS_PX, first + 1, (width, height))
+        cut = np.ascontiguousarray(rgb[first[1] : last[1], first[0] : last[0]])
+        return cls(cv2.cvtColor(cut, cv2.COLOR_RGB2GRAY), first)
+
+
 class EyePoints(NamedTuple):
     """iris [5, 2] px: centre, then the rim towards the inner corner, above, towards the outer corner and below; lids
-    [16, 2] px, see LOWER_LID and UPPER_LID. Pixel centres at +0.5."""
+    [16, 2] px, see LOWER_LID and UPPER_LID. Pixel centres at +0.5. picture: of the eye."""
 
     iris: np.ndarray
     lids: np.ndarray
+    picture: EyePicture
 
 
 @dataclass(frozen=True)
 class SeenEyes:
     """iris_px [F, 2, 5, 2] and lids_px [F, 2, 16, 2] px of the right and left eye, see EyePoints; NaN where an eye is
-    not seen."""
+    not seen. pictures [F][2]: of both eyes, None there; empty where nobody needs them any more."""
 
     iris_px: np.ndarray
     lids_px: np.ndarray
+    pictures: tuple[tuple[EyePicture | None, EyePicture | None], ...]
 
     @classmethod
     def of(cls, frames: list[tuple[EyePoints | None, EyePoints | None] | None]) -> SeenEyes:
         """From what the network says of each frame; None where the frame shows no face."""
-        seen = cls(np.full((len(frames), 2, 5, 2), np.nan), np.full((len(frames), 2, 16, 2), np.nan))
+        iris_px, lids_px = np.full((len(frames), 2, 5, 2), np.nan), np.full((len(frames), 2, 16, 2), np.nan)
+        pictures = []
         for f, eyes in enumerate(frames):
-            for side, eye in enumerate(eyes or (None, None)):
+            eyes = eyes or (None, None)
+            for side, eye in enumerate(eyes):
                 if eye is not None:
-                    seen.iris_px[f, side], seen.lids_px[f, side] = eye
-        return seen
+                    iris_px[f, side], lids_px[f, side] = eye.iris, eye.lids
+            pictures.append(tuple(None if eye is None else eye.picture for eye in eyes))
+        return cls(iris_px, lids_px, tuple(pictures))
 
     def subset(self, frames: np.ndarray) -> SeenEyes:
-        """Chosen frames [K], indices or bool."""
-        return SeenEyes(self.iris_px[frames], self.lids_px[frames])
+        """Chosen frames [K], indices."""
+        return SeenEyes(self.iris_px[frames], self.lids_px[frames], tuple(self.pictures[f] for f in frames))
 
 
 class IrisNetwork:
@@ -87,7 +111,7 @@ class IrisNetwork:
         iris, contours = run_network(self._network, crop, (15, 3 * CONTOUR_COUNT))
         points = np.concatenate([iris.reshape(5, 3), contours.reshape(CONTOUR_COUNT, 3)[:LID_COUNT]])[:, :2]
         points = points.astype(np.float64) @ image_from_crop[:, :2].T + image_from_crop[:, 2]
-        return EyePoints(points[:5], points[5:])
+        return EyePoints(points[:5], points[5:], EyePicture.of(rgb, points[5:]))
 
 
 def crop_of_eye(corners: np.ndarray, left: bool = False) -> np.ndarray | None:

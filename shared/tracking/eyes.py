@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +12,11 @@ from shared.geometry.eyeballs import SIDES, eyeballs_of
 from shared.geometry.surface import Surface
 from shared.tracking.gaze import CENTRE_SIGMA_MM, Gaze, iris_distance, solve_gaze
 from shared.tracking.head_scale import BY_MODEL, HeadScale, scale_by_iris, scale_by_length
+from shared.tracking.iris_texture import follow_irises
 from shared.tracking.lids import Lids, closures, lids_of
+
+FOLLOWED = 3
+"""Times that irises are followed by their texture, and gaze and the eyeballs' centres solved from them anew."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,8 @@ def _rounded(values: np.ndarray, digits: int) -> list[float | None]:
 def track_eyes(
     surface: Surface, seen: SeenEyes, camera_from_head: np.ndarray, intrinsics: np.ndarray, time_s: np.ndarray
 ) -> TrackedEyes | None:
-    """Lids and gaze of the F frames in which the head has a pose; None where the mesh has no eyeballs.
+    """Lids and gaze of the F frames in which the head has a pose; None where the mesh has no eyeballs. Where `seen` has
+    pictures its irises are followed by their texture, and what is returned has these and no pictures.
 
     camera_from_head [F, 4, 4] mm; intrinsics [3, 3]; time_s [F].
     """
@@ -83,10 +88,18 @@ def track_eyes(
         return None
     centres = np.stack([ball.centre for ball in eyeballs])
     lids = lids_of(seen.lids_px, centres, camera_from_head, intrinsics)
-    gaze = solve_gaze(
-        seen.iris_px, ~lids.shut, centres, iris_distance(eyeballs), camera_from_head, intrinsics, time_s
-    )
-    return TrackedEyes(seen, lids, gaze)
+    distance_mm = iris_distance(eyeballs)
+
+    def solved(iris_px: np.ndarray) -> Gaze | None:
+        return solve_gaze(iris_px, ~lids.shut, centres, distance_mm, camera_from_head, intrinsics, time_s)
+
+    gaze = solved(seen.iris_px)
+    if gaze is not None and seen.pictures:
+        for _ in range(FOLLOWED):
+            iris_px = follow_irises(seen, gaze.gaze, gaze.centres, gaze.iris_distance_mm, camera_from_head, intrinsics)
+            seen = replace(seen, iris_px=iris_px)
+            gaze = solved(iris_px)
+    return TrackedEyes(replace(seen, pictures=()), lids, gaze)
 
 
 def lids_in_frames(landmarks: Mapping[str, np.ndarray], record: Mapping, frame_index: np.ndarray) -> np.ndarray | None:

@@ -17,9 +17,8 @@ from shared.tracking.expression import turn_basis
 SHUT_READS = 0.1, 0.45
 """Of an eye's open aperture: what the network still reports when it is shut, the more the darker its lashes are. Where
 the eye blinks, its own lowest value between these is it."""
-SHUT = 0.6
-"""Of the way from there to open: lids that are nearer are more than half closed, since the network sees them come down
-late."""
+SHUT = 0.5
+"""Of the aperture of open eyes: lids that leave less are more than half closed."""
 LEAST_OPEN = 0.165
 """Of the eye's width: what is no farther open in most frames is shut throughout. Eyes that squint have 0.21, of shut
 ones the network reports up to 0.16 in hard light."""
@@ -28,9 +27,8 @@ OTHER_EYE = 1.0 / 3.0
 UPPER, LOWER, CORNERS = slice(10, 15), slice(2, 7), (0, 8)
 """Of the lids' sixteen points: the middle of both margins, and the outer and inner corner."""
 LATE, SLACK = 0.2, 0.25
-"""Of the way from shut to open: up to here lids are shut already, since the network sees them come down late, and open
-again early. Three synthetic clips that blink: on the way from there on, the eye is open by the square of it. Of the
-latter, from open on: apertures of open eyes wander by that with the pose and the network's noise."""
+"""Of the way from shut to open: up to here lids are shut already, see _apertures; and from open on, since apertures of
+open eyes wander by that with the pose and the network's noise."""
 ROUNDS, NOT_OPEN = 8, 0.8
 BIAS_PRIOR, LEAST_LEVEL = 0.3, 0.75
 """Ridge on what of the aperture may follow the pose, a share of the evidence, and the least that it may leave of it: a
@@ -59,7 +57,7 @@ def lids_of(lids_px: np.ndarray, centres: np.ndarray, camera_from_head: np.ndarr
             level, open_mm[eye] = _of_open_eyes(apertures[seen, eye], basis[seen])
             openness[seen, eye] = apertures[seen, eye] / level
             opening[0, eye] = open_mm[eye] / np.median(widths[seen, eye])
-    shut = _together(from_shut(openness)) < SHUT
+    shut = _apertures(openness) < SHUT
     always_shut = _together(opening) < LEAST_OPEN
     return Lids(openness, shut | (always_shut & np.isfinite(openness)), open_mm)
 
@@ -71,6 +69,13 @@ def from_shut(openness: np.ndarray) -> np.ndarray:
     return (openness - reads) / (1.0 - reads)
 
 
+def _apertures(openness: np.ndarray) -> np.ndarray:
+    """openness [F, 2] of lids -> the true apertures, [F, 2]: 0 shut, 1 as the clip's open eyes. The network sees lids
+    come down late and open again early: on four synthetic clips that blink the eye is open by the square of what it
+    reads, and shut where that is LATE."""
+    return _together(np.square(np.clip((from_shut(openness) - LATE) / (1.0 - LATE), 0.0, 1.0)))
+
+
 def closures(openness: np.ndarray, shut: np.ndarray) -> np.ndarray:
     """openness [F, 2] of lids and shut [F, 2] bool, see Lids -> how far each eye is shut, [F, 2]: 0 as the clip's open
     eyes are, 1 shut. Where an eye is not seen its lids do as the other one's, where neither is, as in the frames before
@@ -79,8 +84,7 @@ def closures(openness: np.ndarray, shut: np.ndarray) -> np.ndarray:
     known = np.nonzero(np.isfinite(apart).all(1))[0]
     if not len(known):
         return np.zeros_like(openness)
-    aperture = np.square(np.clip((_together(from_shut(apart[known])) - LATE) / (1.0 - LATE), 0.0, 1.0))
-    closed = np.clip((1.0 - aperture - SLACK) / (1.0 - SLACK), 0.0, 1.0)
+    closed = np.clip((1.0 - _apertures(apart[known]) - SLACK) / (1.0 - SLACK), 0.0, 1.0)
     closed[:, shut[known].all(0)] = 0.0
     return np.stack([np.interp(np.arange(len(openness)), known, own) for own in closed.T], axis=1)
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from shared.capture.iris import LOWER_LID, UPPER_LID, EyePoints, crop_of_eye
+from shared.capture.iris import LOWER_LID, UPPER_LID, EyePicture, EyePoints, crop_of_eye
 from shared.tracking.models import own_iris_network
 
 HEIGHT, WIDTH, ENLARGED = 120, 160, 8
@@ -68,8 +68,8 @@ def test_a_mirrored_picture_gives_mirrored_points(network):
     picture = drawn_eye()
     right = network.eye(picture, CORNERS)
     left = network.eye(np.ascontiguousarray(picture[:, ::-1]), mirrored(CORNERS), left=True)
-    for one, other in zip(right, left, strict=True):
-        assert np.allclose(mirrored(other), one, atol=0.05)
+    assert np.allclose(mirrored(left.iris), right.iris, atol=0.05)
+    assert np.allclose(mirrored(left.lids), right.lids, atol=0.05)
 
 
 def test_half_a_pixel_of_shift_is_half_a_pixel(network):
@@ -86,3 +86,12 @@ def test_both_eyes_come_from_the_face_and_a_hidden_one_is_none(network):
     right, left = network.eyes(drawn_eye(), landmarks)
     assert isinstance(right, EyePoints) and left is None
     assert np.array_equal(right.iris, network.eye(drawn_eye(), CORNERS).iris)
+
+
+def test_the_picture_of_an_eye_lies_about_its_lids_and_within_the_frame():
+    rgb, lids = drawn_eye(), np.array([[2.2, 40.0], [30.0, 52.6]])
+    picture = EyePicture.of(rgb, lids)
+    assert picture.corner.tolist() == [0, 36] and picture.grey.shape == (57 - 36, 34)
+    assert np.array_equal(picture.grey, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)[36:57, :34])
+    outside = EyePicture.of(rgb, lids + (WIDTH, 0))
+    assert outside.grey.shape[1] >= 1 and outside.corner[0] <= WIDTH - 1

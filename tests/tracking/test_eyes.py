@@ -4,7 +4,7 @@ import numpy as np
 from field_check import below, field_faults
 from shapes import nods
 
-from shared.capture.iris import EyePoints, SeenEyes
+from shared.capture.iris import EyePicture, EyePoints, SeenEyes
 from shared.contract.records import LANDMARKS, TRACKED_POSES, TRACKING
 from shared.geometry.eyeballs import eyeballs_of
 from shared.geometry.mesh import Mesh
@@ -16,6 +16,7 @@ LENS = np.array([[2700.0, 0, 400], [0, 2700.0, 400], [0, 0, 1]])
 FRAMES = 40
 POSES = nods(20.0 * np.sin(np.linspace(0, 2 * np.pi, FRAMES)))
 SHUT = slice(10, 13)
+BLANK = np.full((800, 800, 3), 90, np.uint8)
 
 
 def surface_of(model):
@@ -35,7 +36,8 @@ def seen_eyes(surface) -> SeenEyes:
             opening = 1.0 if f in range(FRAMES)[SHUT] else 9.0
             lids = np.stack([28.0 * inward * (along - 0.5), opening * above, np.full(16, 14.0)], axis=-1)
             iris = np.column_stack([5.85 * spokes * (inward, 1), np.full(5, 13.8)])
-            eyes.append(EyePoints(*(project(ball.centre + part, pose, LENS)[0] for part in (iris, lids))))
+            iris_px, lids_px = (project(ball.centre + part, pose, LENS)[0] for part in (iris, lids))
+            eyes.append(EyePoints(iris_px, lids_px, EyePicture.of(BLANK, lids_px)))
         frames.append(tuple(eyes))
     return SeenEyes.of([*frames[:-2], (frames[-2][0], None), None])
 
@@ -64,7 +66,7 @@ def test_gaze_is_nan_where_an_eye_is_shut_or_not_seen(model):
 def test_a_clip_of_closed_eyes_has_no_gaze_but_blinks(model):
     surface = surface_of(model)
     seen = seen_eyes(surface)
-    shut = SeenEyes(np.repeat(seen.iris_px[10:11], FRAMES, 0), np.repeat(seen.lids_px[10:11], FRAMES, 0))
+    shut = seen.subset(np.full(FRAMES, 10))
     found = track_eyes(surface, shut, np.repeat(POSES[10:11], FRAMES, 0), LENS, np.arange(FRAMES) / 15.0)
     assert found.gaze is None and np.isnan(found.pose_arrays["gaze"]).all()
     assert field_faults(found.record(np.arange(FRAMES)), below(TRACKING, "eyes")) == []

@@ -1,0 +1,176 @@
+"""Irises followed by their own texture: what the iris network says of an eye that looks aside or down is corrected.
+
+The network puts irises that look aside up to a quarter too near to the middle of the lids, and those that a lid half
+hides too far from it. What is seen of an eyeball in all frames, laid over each other as the gaze turns it, gives a
+mean picture of iris and white; each frame's gaze is then moved until the frame agrees with it (Gauss-Newton steps on
+the brightness, [Baker2004]), and the mean is made anew. Only what lies within the lids counts, and what differs from
+the mean by much, like lids, lashes and catchlights, counts little.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from shared.capture.iris import LOWER_LID, UPPER_LID, EyePicture, SeenEyes
+from shared.compute.robust import ROBUST_SCALE, cauchy_weight
+from shared.geometry.atlas import sample
+from shared.geometry.eyeballs import gaze_direction, gaze_rotation
+from shared.geometry.transforms import camera_centres, project, projection_slope
+
+REACH_MM, LEAST_SPACING_MM, SPACING_PX = 8.5, 0.35, 0.7
+"""Of the mean picture about the iris' centre; between its samples, at least and in pixels."""
+BLUR_PX = 0.5
+LID_MM = 2.0
+"""From the lids' margins: a sample that lies nearer counts less, since their shadow moves with them."""
+LEAST_FACING = 0.3, 0.6
+"""Cosine at which the eyeball's surface begins to count, and from which on it does in full."""
+ROUNDS, STEP = 6, 1.7
+"""Times that all frames are moved, by so much of a Gauss-Newton step: the mean, made of frames that lie apart, holds
+each one back."""
+OUTLIER = 1.7
+"""Deviations beyond which a sample loses its pull."""
+CORRELATED_MM = 2.6
+"""Across: so large an area of what a frame differs by counts as one sample, since shading and lids are behind it."""
+NETWORK_SIGMA = np.radians(4.0)
+"""How far the network's gaze may be off."""
+MEANS, LEAST_NOISE = 4, 1.0
+"""Times that the mean is made anew as outliers lose their pull; deviation of brightness at best, 8-bit codes."""
+HOLDS_GAIN = 100.0
+"""Codes squared by which the mean must vary where a frame sees it, for its gain to be its own."""
+LARGEST_STEP = np.radians(3.0)
+LEAST_SEEN = 0.15
+"""Of what the best seen sample is seen: others have no mean."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Eye:
+    """A frame's view of an eye: layers [h, w, 4] float32: its brightness in 8-bit codes, the slopes of that along x and
+    y, and how much a pixel lies within the lids, 0 to 1; corner [2] px; pose [4, 4]; camera [3] in head space."""
+
+    layers: np.ndarray
+    corner: np.ndarray
+    pose: np.ndarray
+    camera: np.ndarray
+
+
+def follow_irises(
+    seen: SeenEyes,
+    gaze: np.ndarray,
+    centres: np.ndarray,
+    distance_mm: float,
+    camera_from_head: np.ndarray,
+    intrinsics: np.ndarray,
+) -> np.ndarray:
+    """Irises [F, 2, 5, 2] px moved to where their texture is seen; as they were where gaze [F, 2, 2] is NaN.
+
+    seen: eyes of F frames, with pictures; gaze [F, 2, 2] radians, centres [2, 3] mm and distance_mm as solved from its
+    irises (shared.tracking.gaze); camera_from_head [F, 4, 4]; intrinsics [3, 3].
+    """
+    followed = seen.iris_px.copy()
+    for side, centre in enumerate(centres):
+        frames = np.nonzero(np.isfinite(gaze[:, side]).all(-1))[0]
+        if not len(frames):
+            continue
+        poses = camera_from_head[frames]
+        depth = float(np.median(project(centre[None], poses, intrinsics)[1]))
+        ball = _Ball(centre, distance_mm, intrinsics, depth / intrinsics[0, 0])
+        eyes = [
+            ball.view(seen.pictures[frame][side], seen.lids_px[frame, side], pose)
+            for frame, pose in zip(frames, poses, strict=True)
+        ]
+        irises = centre + distance_mm * gaze_direction(ball.aligned(eyes, gaze[frames, side]))
+        now = np.stack([project(iris[None], pose, intrinsics)[0][0] for iris, pose in zip(irises, poses, strict=True)])
+        followed[frames, side] += (now - followed[frames, side, 0])[:, None]
+    return followed
+
+
+class _Ball:
+    """An eyeball: its samples about the iris' centre, in the space in which it looks along +z."""
+
+    def __init__(self, centre: np.ndarray, distance_mm: float, intrinsics: np.ndarray, pixel_mm: float) -> None:
+        """centre [3] mm; distance_mm: of the iris' centre from it; intrinsics [3, 3]; pixel_mm: a pixel's width at the
+        eye."""
+        self._centre, self._radius, self._intrinsics, self._pixel_mm = centre, distance_mm, intrinsics, pixel_mm
+        spacing = max(LEAST_SPACING_MM, SPACING_PX * pixel_mm)
+        along = np.arange(-REACH_MM, REACH_MM + 1e-6, spacing)
+        across = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+        off = np.linalg.norm(across, axis=1)
+        inside = off < min(REACH_MM, 0.95 * distance_mm)
+        height = np.sqrt(distance_mm**2 - off[inside] ** 2)
+        self._local = np.column_stack([across[inside], height])
+        self._share = min((spacing / CORRELATED_MM) ** 2, 1.0)
+
+    def view(self, picture: EyePicture, lids_px: np.ndarray, camera_from_head: np.ndarray) -> _Eye:
+        """The eye in a frame: its picture, lids_px [16, 2] px, the pose [4, 4]."""
+        light = cv2.GaussianBlur(picture.grey.astype(np.float32), (0, 0), BLUR_PX)
+        outline = lids_px[[*LOWER_LID, *UPPER_LID[-2:0:-1]]] - picture.corner
+        within = np.zeros(light.shape, np.uint8)
+        cv2.fillPoly(within, [np.rint(16.0 * (outline - 0.5)).astype(np.int32)], 1, lineType=cv2.LINE_8, shift=4)
+        depth = cv2.distanceTransform(within, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * self._pixel_mm
+        slopes = (cv2.Sobel(light, cv2.CV_32F, *way, ksize=3, scale=1 / 8) for way in ((1, 0), (0, 1)))
+        layers = np.stack([light, *slopes, np.clip(depth / LID_MM, 0.0, 1.0)], axis=-1).astype(np.float32)
+        return _Eye(layers, picture.corner, camera_from_head, camera_centres(camera_from_head))
+
+    def aligned(self, eyes: list[_Eye], gaze: np.ndarray) -> np.ndarray:
+        """Gaze [F, 2] with which all eyes [F] agree best; gaze [F, 2]: the network's. Their median stays: a mean
+        picture tells nothing of it."""
+        found = gaze.copy()
+        for _ in range(ROUNDS):
+            samples = [self._samples(eye, own) for eye, own in zip(eyes, found, strict=True)]
+            light, slopes, weight = (np.stack(part) for part in zip(*samples, strict=True))
+            residual, weight, noise = _against_mean(light, weight)
+            told = weight * (self._share / noise**2)
+            normal = np.einsum("fn,fni,fnj->fij", told, slopes, slopes) + np.eye(2) / NETWORK_SIGMA**2
+            right = np.einsum("fn,fni->fi", told * residual, slopes) + (found - gaze) / NETWORK_SIGMA**2
+            step = np.linalg.solve(normal, right[..., None])[..., 0]
+            found -= np.clip(STEP * step, -LARGEST_STEP, LARGEST_STEP)
+            found -= np.median(found - gaze, axis=0)
+        return found
+
+    def _samples(self, eye: _Eye, gaze: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """An eye that looks along gaze [2]: brightness [N] of its samples, the slopes [N, 2] of that by the gaze, and
+        how much they count, [N]."""
+        arm = self._local @ gaze_rotation(gaze).T
+        places = self._centre + arm
+        pixels = project(places, eye.pose, self._intrinsics)[0] - eye.corner
+        seen = sample(eye.layers, pixels[None])[0]
+        slope = projection_slope(places, eye.pose, self._intrinsics)
+        axes = np.array([[0.0, 1.0, 0.0], [-np.cos(gaze[0]), 0.0, np.sin(gaze[0])]])
+        moved = np.stack([np.cross(axis, arm) for axis in axes], axis=-1)
+        by_gaze = np.einsum("ni,nij,njk->nk", seen[:, 1:3], slope, moved)
+        sight = eye.camera - places
+        facing = (arm * sight).sum(1) / (self._radius * np.linalg.norm(sight, axis=1))
+        low, high = LEAST_FACING
+        return seen[:, 0], by_gaze, seen[:, 3] * np.clip((facing - low) / (high - low), 0.0, 1.0)
+
+
+def _against_mean(light: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What brightness [F, N] differs by from the mean over the frames under each frame's own light, a gain and an
+    offset; what it counts, less for outliers and none where there is no mean; deviation [F, 1] of the rest. weight [F,
+    N]."""
+    counts, level = weight, (weight * light).sum(1, keepdims=True) / np.maximum(weight.sum(1, keepdims=True), 1e-9)
+    gain, offset = np.maximum(level, 1.0) / np.median(level), np.zeros_like(level)
+    for _ in range(MEANS):
+        total = counts.sum(0)
+        mean = (counts * (light - offset) / gain).sum(0) / np.maximum(total, 1e-9)
+        known = weight * (total > LEAST_SEEN * total.max())
+        counts = known * counts
+        residual = light - gain * mean - offset
+        noise = np.maximum(ROBUST_SCALE * float(np.median(np.abs((residual / gain)[weight > 0.5]))), LEAST_NOISE) * gain
+        counts = known * cauchy_weight(residual, OUTLIER * noise) ** 2
+        gain, offset = _light(light, mean, counts, gain)
+    return light - gain * mean - offset, counts, noise
+
+
+def _light(light: np.ndarray, mean: np.ndarray, counts: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gain and offset [F, 1] that turn the mean [N] into brightness [F, N], by least squares with weights counts [F,
+    N]; a tenth of what counts holds the gain [F, 1] to what it was."""
+    total = counts.sum(1, keepdims=True) + 1e-9
+    middle, usual = (counts * mean).sum(1, keepdims=True) / total, (counts * light).sum(1, keepdims=True) / total
+    around = counts * (mean - middle)
+    spread = (around * (mean - middle)).sum(1, keepdims=True) + total * HOLDS_GAIN
+    gain = ((around * light).sum(1, keepdims=True) + gain * total * HOLDS_GAIN) / spread
+    return gain, usual - gain * middle
