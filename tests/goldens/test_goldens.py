@@ -5,6 +5,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -50,6 +51,13 @@ def test_the_chain_is_as_good_as_it_was(tiny_run):
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: m.name)
 def test_constants_of_the_list_stand_where_it_says(mutation):
     assert mutation.after in mutated_text(mutation)
+
+
+def test_highlights_five_percent_stronger_are_noticed(runs):
+    """What the mutations of inverse_render ask of its golden file, without another run of it."""
+    name, found = "specular intensity, roughness", runs["inverse_render", OWN.name].measures
+    changed = dict(found) | {name: replace(found[name], values=1.05 * found[name].values)}
+    assert [line for line in differences("inverse_render", changed, read_golden("inverse_render")) if name in line]
 
 
 @pytest.mark.parametrize("mutation", [m for m in MUTATIONS if m.quick or SLOW], ids=lambda m: m.name)

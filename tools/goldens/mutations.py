@@ -54,7 +54,7 @@ MUTATIONS = (
              "SEEN_WEIGHT = 0.525"),
     Mutation("BRDF: normal incidence", "inverse_render", "shared/rendering/brdf.py", "\nF0 = 0.04", "\nF0 = 0.042"),
     Mutation("prior: specular intensity", "inverse_render", "stages/inverse_render.py", '"specular_prior", float, 0.7',
-             '"specular_prior", float, 0.735', quick=True),
+             '"specular_prior", float, 0.735'),
     Mutation("shape: smoothness", "inverse_render", "stages/inverse_render.py", '"shape_smoothness", float, 19.0',
              '"shape_smoothness", float, 19.95'),
     Mutation("texture: prior's spread", "inverse_render", "shared/appearance/texture.py", "PRIOR_SPREAD = 0.3",
