@@ -4,6 +4,7 @@ import atexit
 import fcntl
 import os
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -14,13 +15,14 @@ sys.path.insert(0, str(Path(__file__).parent / "helpers"))
 pytest_plugins = ["random_order"]
 
 
-@pytest.fixture(scope="session", autouse=True)
-def cache_of_the_tests(tmp_path_factory, worker_id):
-    """What the processes that tests start keep for each other lies with the tests' own files, not with the user's."""
-    folder = tmp_path_factory.getbasetemp()
-    os.environ["LIMN_CACHE"] = str((folder if worker_id == "master" else folder.parent) / "cache")
-    yield
-    del os.environ["LIMN_CACHE"]
+def pytest_configure(config):
+    """What the processes of the tests keep for each other, compiled loops above all, goes with the tests and is not the
+    user's. Loops ask for the folder as they are imported, so that it must be there before tests are collected; workers
+    have the first process's."""
+    if not hasattr(config, "workerinput"):
+        folder = tempfile.TemporaryDirectory(prefix="limn-tests-")
+        config.add_cleanup(folder.cleanup)
+        os.environ["LIMN_CACHE"] = folder.name
 
 
 @pytest.fixture(scope="session")
