@@ -12,7 +12,7 @@ import pytest
 from slow import SLOW
 
 from tools.goldens.chain import chain_differences
-from tools.goldens.golden import differences, distance, read_golden, run_all, run_from_inputs
+from tools.goldens.golden import differences, distance, midway, read_golden, run_all, run_from_inputs
 from tools.goldens.inputs import kept_folder, stage_of
 from tools.goldens.kernels import LEAST, OWN, WAYS
 from tools.goldens.measures import Measure
@@ -79,6 +79,16 @@ def test_differences_are_told_from_the_same():
     assert distance(Measure(np.array([np.nan, 2.0])), reference) == np.inf
     words = Measure(np.array(["a", "b"]), exact=True)
     assert distance(words, words) == 0.0 and distance(Measure(np.array(["a", "c"]), exact=True), words) == np.inf
+
+
+def test_golden_values_lie_midway_between_those_farthest_apart():
+    ways = [Measure(np.array([1.0, 5.0]), 2.0), Measure(np.array([3.0, 4.0]), 2.0), Measure(np.array([2.0, 4.5]), 2.0)]
+    middle = midway(ways[0], ways)
+    assert middle.values.tolist() == [2.0, 4.5] and middle.scale == 2.0
+    assert max(distance(way, middle) for way in ways) < distance(ways[1], ways[0])
+    words = Measure(np.array(["a"]), exact=True)
+    assert midway(words, [words, words]) is words
+    assert midway(ways[0], [ways[0], Measure(np.array([1.0]))]) is ways[0]
 
 
 def test_a_kernel_reaches_the_libraries(tmp_path):
