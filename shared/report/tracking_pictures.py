@@ -96,8 +96,11 @@ def _plot(time_s, values, deviation, names, unit) -> np.ndarray:
         y = PLOT_HEIGHT - 24 - (value - low) / (high - low) * (PLOT_HEIGHT - 44)
         return np.stack([x, y], axis=-1)
 
+    def sixteenths(places):  # a point that lies between two pixels would fall to either one by the processor
+        return np.rint(16.0 * places).astype(np.int32)
+
     for value in np.linspace(low, high, 5):
-        y = int(at(time_s[0], value)[1])
+        y = round(float(at(time_s[0], value)[1]))  # it is a whole number or nearly so
         cv2.line(canvas, (MARGIN, y), (PLOT_WIDTH - 12, y), GRID, 1)
         cv2.putText(canvas, f"{value:.3g}", (4, y + 4), cv2.FONT_HERSHEY_SIMPLEX, 0.4, INK, 1, cv2.LINE_AA)
     for k, (name, colour) in enumerate(zip(names, CURVE_COLOURS[: len(names)], strict=True)):
@@ -106,10 +109,10 @@ def _plot(time_s, values, deviation, names, unit) -> np.ndarray:
                 reach = 2 * deviation[part, k]
                 upper, lower = (at(time_s[part], values[part, k] + side * reach) for side in (1, -1))
                 band = canvas.copy()
-                cv2.fillPoly(band, [np.concatenate([upper, lower[::-1]]).astype(np.int32)], colour)
+                cv2.fillPoly(band, [sixteenths(np.concatenate([upper, lower[::-1]]))], colour, cv2.LINE_AA, 4)
                 canvas = cv2.addWeighted(band, 0.35, canvas, 0.65, 0.0)
-            line = at(time_s[part], values[part, k]).astype(np.int32)
-            cv2.polylines(canvas, [line], False, colour, 1, cv2.LINE_AA)
+            line = sixteenths(at(time_s[part], values[part, k]))
+            cv2.polylines(canvas, [line], False, colour, 1, cv2.LINE_AA, 4)
         cv2.putText(canvas, name, (MARGIN + 90 * k, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
     label = f"{unit} over {span_s:.1f} s"
     cv2.putText(canvas, label, (PLOT_WIDTH - 260, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
