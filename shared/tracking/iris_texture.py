@@ -157,7 +157,6 @@ def _against_mean(light: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np
         total = counts.sum(0)
         mean = (counts * (light - offset) / gain).sum(0) / np.maximum(total, 1e-9)
         known = weight * (total > LEAST_SEEN * total.max())
-        counts = known * counts
         residual = light - gain * mean - offset
         noise = np.maximum(ROBUST_SCALE * float(np.median(np.abs((residual / gain)[weight > 0.5]))), LEAST_NOISE) * gain
         counts = known * cauchy_weight(residual, OUTLIER * noise) ** 2
