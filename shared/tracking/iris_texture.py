@@ -116,11 +116,13 @@ class _Ball:
 
     def aligned(self, eyes: list[_Eye], gaze: np.ndarray) -> np.ndarray:
         """Gaze [F, 2] with which all eyes [F] agree best; gaze [F, 2]: the network's. Their median stays: a mean
-        picture tells nothing of it."""
+        picture tells nothing of it. All stay where lids leave nothing to look at."""
         found = gaze.copy()
         for _ in range(ROUNDS):
             samples = [self._samples(eye, own) for eye, own in zip(eyes, found, strict=True)]
             light, slopes, weight = (np.stack(part) for part in zip(*samples, strict=True))
+            if not weight.any():
+                return found
             residual, weight, noise = _against_mean(light, weight)
             told = weight * (self._share / noise**2)
             normal = np.einsum("fn,fni,fnj->fij", told, slopes, slopes) + np.eye(2) / NETWORK_SIGMA**2
@@ -152,13 +154,14 @@ def _against_mean(light: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np
     offset; what it counts, less for outliers and none where there is no mean; deviation [F, 1] of the rest. weight [F,
     N]."""
     counts, level = weight, (weight * light).sum(1, keepdims=True) / np.maximum(weight.sum(1, keepdims=True), 1e-9)
-    gain, offset = np.maximum(level, 1.0) / np.median(level), np.zeros_like(level)
+    gain, offset = np.maximum(level, 1.0) / max(float(np.median(level)), 1.0), np.zeros_like(level)
     for _ in range(MEANS):
         total = counts.sum(0)
         mean = (counts * (light - offset) / gain).sum(0) / np.maximum(total, 1e-9)
         known = weight * (total > LEAST_SEEN * total.max())
         residual = light - gain * mean - offset
-        noise = np.maximum(ROBUST_SCALE * float(np.median(np.abs((residual / gain)[weight > 0.5]))), LEAST_NOISE) * gain
+        spread = np.median(np.abs((residual / gain)[weight > 0.5 * weight.max()]))
+        noise = max(ROBUST_SCALE * float(spread), LEAST_NOISE) * gain
         counts = known * cauchy_weight(residual, OUTLIER * noise) ** 2
         gain, offset = _light(light, mean, counts, gain)
     return light - gain * mean - offset, counts, noise

@@ -99,3 +99,14 @@ def test_the_rim_goes_with_the_centre_and_eyes_without_gaze_stay():
     assert np.array_equal(found[5], seen.iris_px[5]) and np.array_equal(found[7, 1], seen.iris_px[7, 1])
     rims, before = found - found[:, :, :1], seen.iris_px - seen.iris_px[:, :, :1]
     assert np.allclose(rims, before, atol=1e-9) and (found[8] != seen.iris_px[8]).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.15])
+def test_lids_that_leave_little_or_nothing_to_look_at_leave_irises_that_are_finite(share):
+    gaze = gaze_on_the_camera()
+    seen = drawn(gaze, np.ones(FRAMES), glint=False)
+    middle = seen.lids_px.mean(2, keepdims=True)
+    narrow = replace(seen, lids_px=middle + (seen.lids_px - middle) * (1.0, share))
+    found = follow_irises(narrow, 0.75 * gaze, CENTRES, RADIUS_MM, poses(), LENS)
+    off = np.linalg.norm(found[:, :, 0] - iris_centres(gaze), axis=-1)
+    assert np.isfinite(found).all() and off.max() < 4.0
