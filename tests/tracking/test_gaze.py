@@ -71,6 +71,19 @@ class TestKinds:
         assert found.kind == "camera" and np.nanmean(error_deg(found, gaze)) < 1.5
         assert np.abs(found.centres - CENTRES)[:, :2].max() < 0.5 < np.abs(off)[:, :2].max()
 
+    def test_eyeballs_that_begin_too_high_still_look_into_the_camera(self):
+        """By as much as fitted heads are off: the gaze is not turned down to a place below the lens."""
+        poses = turning()
+        gaze = towards_camera(poses)
+        found = solved(gaze, poses, centres=CENTRES + [0.3, 2.2, 0.5])
+        assert found.kind == "camera" and np.nanmean(error_deg(found, gaze)) < 2.0
+
+    def test_a_place_beside_the_camera_is_one_of_its_own(self):
+        poses = turning()
+        gaze = towards_camera(poses) + np.radians([9.0, -6.0])
+        found = solved(gaze, poses)
+        assert found.kind == "place" and np.nanmean(error_deg(found, gaze)) < 2.5
+
     def test_a_gaze_fixed_in_the_head_is_told_from_one_on_the_camera(self):
         poses, gaze = turning(), np.full((FRAMES, 2, 2), (0.1, -0.05))
         found = solved(gaze, poses)
