@@ -13,6 +13,9 @@ REFERENCES = {
     "Beaton1974":
         "Beaton, Tukey, The Fitting of Power Series, Meaning Polynomials, Illustrated on Band-Spectroscopic Data. "
         "Technometrics 16, 1974.",
+    "Becker1988":
+        "Becker, Fuchs, Lid-Eye Coordination During Vertical Gaze Changes in Man and Monkey. Journal of "
+        "Neurophysiology 60, 1988.",
     "Bekerman2014":
         "Bekerman, Gottlieb, Vaiman, Variations in Eyeball Diameters of the Healthy Adults. Journal of Ophthalmology, "
         "2014.",
@@ -37,6 +40,9 @@ REFERENCES = {
     "Collins2014":
         "Collins, Bartoli, Infinitesimal Plane-Based Pose Estimation. International Journal of Computer Vision 109, "
         "2014.",
+    "Daugman1993":
+        "Daugman, High Confidence Visual Recognition of Persons by a Test of Statistical Independence. IEEE "
+        "Transactions on Pattern Analysis and Machine Intelligence 15, 1993.",
     "Dempster1977":
         "Dempster, Laird, Rubin, Maximum Likelihood from Incomplete Data via the EM Algorithm. Journal of the Royal "
         "Statistical Society B 39, 1977.",

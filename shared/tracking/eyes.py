@@ -12,7 +12,7 @@ from shared.geometry.eyeballs import SIDES, eyeballs_of
 from shared.geometry.surface import Surface
 from shared.tracking.gaze import CENTRE_SIGMA_MM, Gaze, iris_distance, solve_gaze
 from shared.tracking.head_scale import BY_MODEL, HeadScale, scale_by_iris, scale_by_length
-from shared.tracking.iris_texture import follow_irises
+from shared.tracking.iris_texture import follow_irises, lay_on_rims
 from shared.tracking.lids import Lids, closures, lids_of
 
 FOLLOWED = 3
@@ -93,12 +93,18 @@ def track_eyes(
     def solved(iris_px: np.ndarray) -> Gaze | None:
         return solve_gaze(iris_px, ~lids.shut, centres, distance_mm, camera_from_head, intrinsics, time_s)
 
+    def ball(gaze: Gaze) -> tuple:
+        return gaze.gaze, gaze.centres, gaze.iris_distance_mm
+
     gaze = solved(seen.iris_px)
     if gaze is not None and seen.pictures:
         for _ in range(FOLLOWED):
-            iris_px = follow_irises(seen, gaze.gaze, gaze.centres, gaze.iris_distance_mm, camera_from_head, intrinsics)
-            seen = replace(seen, iris_px=iris_px)
-            gaze = solved(iris_px)
+            seen = replace(seen, iris_px=follow_irises(seen, *ball(gaze), camera_from_head, intrinsics))
+            gaze = solved(seen.iris_px)
+        if np.isfinite(gaze.iris_radius_mm):
+            irises = lay_on_rims(seen, *ball(gaze), gaze.iris_radius_mm, camera_from_head, intrinsics)
+            seen = replace(seen, iris_px=irises)
+            gaze = solved(irises)
     return TrackedEyes(replace(seen, pictures=()), lids, gaze)
 
 

@@ -4,11 +4,13 @@ The network puts irises that look aside up to a quarter too near to the middle o
 hides too far from it. What is seen of an eyeball in all frames, laid over each other as the gaze turns it, gives a
 mean picture of iris and white; each frame's gaze is then moved until the frame agrees with it (Gauss-Newton steps on
 the brightness, [Baker2004]), and the mean is made anew. Only what lies within the lids counts, and what differs from
-the mean by much, like lids, lashes and catchlights, counts little.
+the mean by much, like lids, lashes and catchlights, counts little. What the network is off by in all frames alike the
+last mean tells, in which the irises' rims are plain.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -17,8 +19,9 @@ import numpy as np
 from shared.capture.iris import LOWER_LID, UPPER_LID, EyePicture, SeenEyes
 from shared.compute.robust import ROBUST_SCALE, cauchy_weight
 from shared.geometry.atlas import sample
-from shared.geometry.eyeballs import gaze_direction, gaze_rotation
+from shared.geometry.eyeballs import gaze_rotation
 from shared.geometry.transforms import camera_centres, project, projection_slope
+from shared.tracking.iris_rim import MeanPicture, fit_rims
 
 REACH_MM, LEAST_SPACING_MM, SPACING_PX = 8.5, 0.35, 0.7
 """Of the mean picture about the iris' centre; between its samples, at least and in pixels."""
@@ -41,8 +44,8 @@ MEANS, LEAST_NOISE = 4, 1.0
 HOLDS_GAIN = 100.0
 """Codes squared by which the mean must vary where a frame sees it, for its gain to be its own."""
 LARGEST_STEP = np.radians(3.0)
-LEAST_SEEN = 0.15
-"""Of what the best seen sample is seen: others have no mean."""
+LEAST_SEEN, WELL_SEEN = 0.15, 0.5
+"""Of what the best seen sample is seen: what is seen less has no mean, and what is seen more a good one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +73,55 @@ def follow_irises(
     irises (shared.tracking.gaze); camera_from_head [F, 4, 4]; intrinsics [3, 3].
     """
     followed = seen.iris_px.copy()
+    for side, frames, ball, eyes in _balls(seen, gaze, centres, distance_mm, camera_from_head, intrinsics):
+        turned = ball.aligned(eyes, gaze[frames, side])
+        now = ball.shown(np.array([0.0, 0.0, distance_mm]), turned, camera_from_head[frames])
+        followed[frames, side] += (now - followed[frames, side, 0])[:, None]
+    return followed
+
+
+def lay_on_rims(
+    seen: SeenEyes,
+    gaze: np.ndarray,
+    centres: np.ndarray,
+    distance_mm: float,
+    radius_mm: float,
+    camera_from_head: np.ndarray,
+    intrinsics: np.ndarray,
+) -> np.ndarray:
+    """Irises [F, 2, 5, 2] px whose circles are moved and grown, by the same in all frames, to where the mean pictures
+    show them, see shared.tracking.iris_rim.
+
+    radius_mm: what the circles have now; seen, gaze [F, 2, 2] radians, centres [2, 3] mm, distance_mm,
+    camera_from_head [F, 4, 4] and intrinsics [3, 3] as in follow_irises."""
+    laid = seen.iris_px.copy()
+    balls = list(_balls(seen, gaze, centres, distance_mm, camera_from_head, intrinsics))
+    pictures = [ball.mean_picture(eyes, gaze[frames, side]) for side, frames, ball, eyes in balls]
+    known = [k for k, picture in enumerate(pictures) if picture is not None]
+    if not known:
+        return laid
+    rims, rim_mm = fit_rims([pictures[k] for k in known], radius_mm)
+    for k, (across, up) in zip(known, rims, strict=True):
+        side, frames, ball, _ = balls[k]
+        ahead = np.array([0.0, 0.0, distance_mm])
+        beside = np.array([across, up, np.sqrt(distance_mm**2 - across**2 - up**2)])
+        poses = camera_from_head[frames]
+        step = ball.shown(beside, gaze[frames, side], poses) - ball.shown(ahead, gaze[frames, side], poses)
+        irises = laid[frames, side]
+        grown = irises[:, :1] + rim_mm / radius_mm * (irises - irises[:, :1])
+        laid[frames, side] = grown + step[:, None]
+    return laid
+
+
+def _balls(
+    seen: SeenEyes,
+    gaze: np.ndarray,
+    centres: np.ndarray,
+    distance_mm: float,
+    camera_from_head: np.ndarray,
+    intrinsics: np.ndarray,
+) -> Iterator[tuple[int, np.ndarray, _Ball, list[_Eye]]]:
+    """Side, frames [K] in which the eye has a gaze, the eyeball and its views in these frames; see follow_irises."""
     for side, centre in enumerate(centres):
         frames = np.nonzero(np.isfinite(gaze[:, side]).all(-1))[0]
         if not len(frames):
@@ -77,14 +129,10 @@ def follow_irises(
         poses = camera_from_head[frames]
         depth = float(np.median(project(centre[None], poses, intrinsics)[1]))
         ball = _Ball(centre, distance_mm, intrinsics, depth / intrinsics[0, 0])
-        eyes = [
+        yield side, frames, ball, [
             ball.view(seen.pictures[frame][side], seen.lids_px[frame, side], pose)
             for frame, pose in zip(frames, poses, strict=True)
         ]
-        irises = centre + distance_mm * gaze_direction(ball.aligned(eyes, gaze[frames, side]))
-        now = np.stack([project(iris[None], pose, intrinsics)[0][0] for iris, pose in zip(irises, poses, strict=True)])
-        followed[frames, side] += (now - followed[frames, side, 0])[:, None]
-    return followed
 
 
 class _Ball:
@@ -101,7 +149,7 @@ class _Ball:
         inside = off < min(REACH_MM, 0.95 * distance_mm)
         height = np.sqrt(distance_mm**2 - off[inside] ** 2)
         self._local = np.column_stack([across[inside], height])
-        self._share = min((spacing / CORRELATED_MM) ** 2, 1.0)
+        self._spacing_mm, self._share = spacing, min((spacing / CORRELATED_MM) ** 2, 1.0)
 
     def view(self, picture: EyePicture, lids_px: np.ndarray, camera_from_head: np.ndarray) -> _Eye:
         """The eye in a frame: its picture, lids_px [16, 2] px, the pose [4, 4]."""
@@ -114,6 +162,24 @@ class _Ball:
         layers = np.stack([light, *slopes, np.clip(depth / LID_MM, 0.0, 1.0)], axis=-1).astype(np.float32)
         return _Eye(layers, picture.corner, camera_from_head, camera_centres(camera_from_head))
 
+    def shown(self, local: np.ndarray, gaze: np.ndarray, camera_from_head: np.ndarray) -> np.ndarray:
+        """[F, 2] px: where frames with gaze [F, 2] and poses [F, 4, 4] show a place local [3] mm of the eyeball's
+        space."""
+        places = self._centre + np.einsum("fij,j->fi", gaze_rotation(gaze), local)
+        return np.stack([project(place[None], pose, self._intrinsics)[0][0] for place, pose in
+                         zip(places, camera_from_head, strict=True)])  # fmt: skip
+
+    def mean_picture(self, eyes: list[_Eye], gaze: np.ndarray) -> MeanPicture | None:
+        """What eyes [F] that look along gaze [F, 2] show of the eyeball in the mean; None where lids hide all."""
+        samples = [self._samples(eye, own) for eye, own in zip(eyes, gaze, strict=True)]
+        light, _, weight = (np.stack(part) for part in zip(*samples, strict=True))
+        if not weight.any():
+            return None
+        mean, total = _against_mean(light, weight)[3:]
+        known = total > LEAST_SEEN * total.max()
+        share = np.minimum(total[known] / (WELL_SEEN * total.max()), 1.0)
+        return MeanPicture(self._local[known, :2], mean[known], share, self._spacing_mm)
+
     def aligned(self, eyes: list[_Eye], gaze: np.ndarray) -> np.ndarray:
         """Gaze [F, 2] with which all eyes [F] agree best; gaze [F, 2]: the network's. Their median stays: a mean
         picture tells nothing of it. All stay where lids leave nothing to look at."""
@@ -123,7 +189,7 @@ class _Ball:
             light, slopes, weight = (np.stack(part) for part in zip(*samples, strict=True))
             if not weight.any():
                 return found
-            residual, weight, noise = _against_mean(light, weight)
+            residual, weight, noise = _against_mean(light, weight)[:3]
             told = weight * (self._share / noise**2)
             normal = np.einsum("fn,fni,fnj->fij", told, slopes, slopes) + np.eye(2) / NETWORK_SIGMA**2
             right = np.einsum("fn,fni->fi", told * residual, slopes) + (found - gaze) / NETWORK_SIGMA**2
@@ -149,10 +215,12 @@ class _Ball:
         return seen[:, 0], by_gaze, seen[:, 3] * np.clip((facing - low) / (high - low), 0.0, 1.0)
 
 
-def _against_mean(light: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _against_mean(
+    light: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """What brightness [F, N] differs by from the mean over the frames under each frame's own light, a gain and an
-    offset; what it counts, less for outliers and none where there is no mean; deviation [F, 1] of the rest. weight [F,
-    N]."""
+    offset; what it counts, less for outliers and none where there is no mean; deviation [F, 1] of the rest; the mean
+    [N] and what all frames count there, [N]. weight [F, N]."""
     counts, level = weight, (weight * light).sum(1, keepdims=True) / np.maximum(weight.sum(1, keepdims=True), 1e-9)
     gain, offset = np.maximum(level, 1.0) / max(float(np.median(level)), 1.0), np.zeros_like(level)
     for _ in range(MEANS):
@@ -164,7 +232,7 @@ def _against_mean(light: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np
         noise = max(ROBUST_SCALE * float(spread), LEAST_NOISE) * gain
         counts = known * cauchy_weight(residual, OUTLIER * noise) ** 2
         gain, offset = _light(light, mean, counts, gain)
-    return light - gain * mean - offset, counts, noise
+    return light - gain * mean - offset, counts, noise, mean, total
 
 
 def _light(light: np.ndarray, mean: np.ndarray, counts: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,9 +8,9 @@ from quick import TINY
 from test_score import TURN, export_from_truth
 
 from shared.geometry.eyeballs import gaze_direction, gaze_towards
-from shared.geometry.transforms import WORLD_FROM_CAMERA, rigid
+from shared.geometry.transforms import WORLD_FROM_CAMERA, project, rigid
 from shared.io.arrays import load_arrays, save_arrays, write_json
-from tools.scoring.gaze import REGION, eye_pixels, found_gaze, gaze_errors
+from tools.scoring.gaze import REGION, eye_pixels, found_gaze, gaze_errors, iris_errors_px
 from tools.scoring.score import score, score_eyes
 from tools.scoring.table import table
 
@@ -85,6 +85,25 @@ def living_tiny(folder, gaze: np.ndarray):
     return folder
 
 
+def test_irises_are_compared_in_pixels_of_the_clip(tmp_path):
+    """The crop is zoomed by two; one iris of twelve frames lies three clip pixels beside the truth, others where it
+    has them; an eye without gaze does not count."""
+    truth = load_arrays(living_tiny(tmp_path / "eyes", some_gaze()) / "gt" / "poses.npz")
+    places = truth["eyeball_centres"] + np.sqrt(16.0**2 - 5.85**2) * gaze_direction(truth["gaze"])
+    irises = np.stack([project(both, pose, truth["K"])[0] for both, pose in
+                       zip(places, truth["camera_from_head"], strict=True)])  # fmt: skip
+    irises[4, 1] += [3.0, 0.0]
+    gaze = truth["gaze"].copy()
+    gaze[7, 0], irises[7, 0] = np.nan, 0.0
+    crop = np.diag([2.0, 2.0, 1.0]) @ truth["K"]
+    index = np.arange(len(gaze))
+    assert iris_errors_px(truth, tmp_path) is None
+    save_arrays(tmp_path / "landmarks.npz", frame_index=index, iris_px=np.repeat(2.0 * irises[:, :, None], 5, axis=2))
+    save_arrays(tmp_path / "poses.npz", frame_index=index, gaze=gaze, intrinsics=truth["K"], intrinsics_crop=crop)
+    found = iris_errors_px(truth, tmp_path)
+    assert found["mean"] == pytest.approx(3.0 / 23, abs=1e-6) and found["median"] < 1e-6
+
+
 def test_the_score_of_a_subject_with_living_eyes(tmp_path):
     gaze, export = some_gaze(), export_from_truth(tmp_path / "run" / "export")
     subject = living_tiny(tmp_path / "eyes", gaze)
@@ -93,7 +112,10 @@ def test_the_score_of_a_subject_with_living_eyes(tmp_path):
     assert without["rerender_eyes"]["psnr"] > 60 and without["rerender_eyes"]["frames"] == 1
     tracked, truth = tmp_path / "run" / "work" / "track_landmarks", load_arrays(subject / "gt" / "poses.npz")
     tracked.mkdir(parents=True)
-    save_arrays(tracked / "poses.npz", gaze=gaze[::2], frame_index=np.arange(0, 12, 2))
+    index = np.arange(0, 12, 2)
+    save_arrays(tracked / "poses.npz", gaze=gaze[::2], frame_index=index, intrinsics=truth["K"],
+                intrinsics_crop=truth["K"])  # fmt: skip
+    save_arrays(tracked / "landmarks.npz", frame_index=index, iris_px=np.zeros((6, 2, 5, 2)))
     scores = score_eyes(subject, export, truth, NOT_TURNED)
     assert scores["gaze"]["frames"] == 6 and scores["gaze"]["deg"]["mean"] < 1e-6
     own = load_arrays(export / "poses.npz")
@@ -106,4 +128,4 @@ def test_the_score_of_a_subject_with_living_eyes(tmp_path):
     assert scores["gaze"]["frames"] == 12 and scores["gaze"]["deg"]["mean"] == pytest.approx(3.0, abs=0.2)
     assert scores["rerender_eyes"]["held_out"]["frames"] == 1
     lines = table(without | scores)
-    assert "none in the truth" in lines and "held out" in lines
+    assert "none in the truth" in lines and "held out" in lines and "centres off by" in lines

@@ -10,7 +10,7 @@ from shared.geometry.eyeballs import gaze_direction, gaze_rotation, gaze_towards
 from shared.geometry.raycast import pixel_directions
 from shared.geometry.transforms import WORLD_FROM_CAMERA, camera_centres, project, rigid, rotation_from_vector
 from shared.tracking.gaze import solve_gaze
-from shared.tracking.iris_texture import follow_irises
+from shared.tracking.iris_texture import follow_irises, lay_on_rims
 
 FRAMES, RADIUS_MM, IRIS_MM, SIZE = 24, 12.0, 5.85, 400
 LENS = np.array([[1700.0, 0, 200], [0, 1700.0, 200], [0, 0, 1]])
@@ -110,3 +110,27 @@ def test_lids_that_leave_little_or_nothing_to_look_at_leave_irises_that_are_fini
     found = follow_irises(narrow, 0.75 * gaze, CENTRES, RADIUS_MM, poses(), LENS)
     off = np.linalg.norm(found[:, :, 0] - iris_centres(gaze), axis=-1)
     assert np.isfinite(found).all() and off.max() < 4.0
+
+
+def test_circles_beside_the_irises_and_too_small_are_laid_on_their_rims():
+    """By the same in all frames; an eye of which nothing is seen stays."""
+    gaze = gaze_on_the_camera()
+    seen = drawn(gaze, np.ones(FRAMES), glint=False)
+    true = iris_centres(gaze)
+    mm_px, aside = LENS[0, 0] / 840.0, np.array([[1.0, 0.8], [-1.2, 0.6]])
+    rims = 5.3 * mm_px * np.array([[0, 0], [1, 0], [0, -1], [-1, 0], [0, 1]])
+    given = replace(seen, iris_px=true[:, :, None] + aside[:, None] + rims)
+    known = gaze.copy()
+    known[..., 0] += aside[:, 0] / (mm_px * RADIUS_MM)
+    known[..., 1] -= aside[:, 1] / (mm_px * RADIUS_MM)
+    known[5] = np.nan
+    found = lay_on_rims(given, known, CENTRES, RADIUS_MM, 5.3, poses(), LENS)
+    assert np.array_equal(found[5], given.iris_px[5])
+    kept = np.arange(FRAMES) != 5
+    off = np.linalg.norm(found[kept][:, :, 0] - true[kept], axis=-1)
+    assert np.linalg.norm(aside, axis=1).min() > 1.2 and np.median(off) < 0.3
+    radius = np.linalg.norm(found[kept][:, :, 1] - found[kept][:, :, 0], axis=-1) / mm_px
+    assert np.median(radius) == pytest.approx(IRIS_MM, rel=0.03)
+    shut = replace(given, lids_px=given.lids_px * 0.0 + given.lids_px.mean(2, keepdims=True))
+    laid = lay_on_rims(shut, known, CENTRES, RADIUS_MM, 5.3, poses(), LENS)
+    np.testing.assert_allclose(laid, given.iris_px, atol=0.05)

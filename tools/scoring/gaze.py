@@ -1,4 +1,4 @@
-"""How far a result's gaze is from the truth, which blinks it found, and how well it draws the eyes anew.
+"""How far a result's gaze and irises are from the truth, which blinks it found, and how well it draws the eyes anew.
 
 Gaze is that of shared.geometry.eyeballs: [F, 2, 2] radians, right eye then left, NaN while shut.
 """
@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from shared.geometry.eyeballs import SIDES, gaze_direction, gaze_towards
+from shared.geometry.eyeballs import IRIS_MM, SIDES, gaze_direction, gaze_towards
 from shared.geometry.raycast import pixel_directions
+from shared.geometry.transforms import project
 from shared.io.arrays import load_arrays
 from tools.scoring.measures import summary
 
@@ -61,6 +62,26 @@ def gaze_errors(truth: np.ndarray, found: Mapping[int, np.ndarray], truth_from_r
             scores[name] = summary(_apart_deg(true[own, eye], seen[own, eye]))
     return scores | {"deg": summary(_apart_deg(true[both], seen[both])),
                      "deg_centred": summary(_apart_deg(true[both], centred[both]))}
+
+
+def iris_errors_px(truth: Mapping[str, np.ndarray], tracked: Path) -> dict | None:
+    """Distances in px of the clip between the true irises' centres and those that track_landmarks, in folder tracked,
+    found, of open eyes with a gaze; None where it found none. truth: gt/poses.npz of living eyes."""
+    if not (tracked / "landmarks.npz").exists():
+        return None
+    marks, poses = load_arrays(tracked / "landmarks.npz"), load_arrays(tracked / "poses.npz")
+    if not ("iris_px" in marks and "gaze" in poses):
+        return None
+    frames, place, own = np.intersect1d(marks["frame_index"], poses["frame_index"], return_indices=True)
+    crop, lens = poses["intrinsics_crop"], poses["intrinsics"]
+    found = (marks["iris_px"][place, :, 0] - crop[:2, 2]) / crop[[0, 1], [0, 1]]
+    found = np.where(np.isfinite(poses["gaze"][own]), found * lens[[0, 1], [0, 1]] + lens[:2, 2], np.nan)
+    ahead = np.sqrt(float(truth["eyeball_radius"]) ** 2 - IRIS_MM**2)
+    irises = truth["eyeball_centres"] + ahead * gaze_direction(truth["gaze"][frames])
+    seen_from = zip(irises, truth["camera_from_head"][frames], strict=True)
+    true = np.array([project(both, pose, truth["K"])[0] for both, pose in seen_from])
+    apart = np.linalg.norm(found - true, axis=-1)
+    return summary(apart[np.isfinite(apart)]) if np.isfinite(apart).any() else None
 
 
 def _apart_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -75,6 +75,8 @@ def _eye_lines(scores: dict) -> list[tuple[str, str]]:
         found = f"{shut['recall']:.1%} found" if "recall" in shut else "none in the truth"
         false = f"; {shut['false']:.1%} of open eyes called shut" if "false" in shut else ""
         lines.append(("blinks", f"{shut['eyes']} shut eyes, {found}{false}; {gaze['frames']} frames"))
+    if "iris_px" in scores:
+        lines.append(("irises", f"centres off by {_spread(scores['iris_px'])} px"))
     if "rerender_eyes" in scores:
         held = scores["rerender_eyes"].get("held_out")
         text = GAINS.format(**scores["rerender_eyes"]) + f", {scores['rerender_eyes']['frames']} frames"
