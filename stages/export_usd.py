@@ -27,7 +27,7 @@ from shared.errors import LimnError
 
 STAGE = Stage(
     name="export_usd",
-    version=14,
+    version=15,
     help="The head as USD, glTF, OBJ and EXR, with a report to judge it by.",
     inputs=("sample_frames", "track_landmarks", "init_albedo", "inverse_render"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -178,11 +178,17 @@ def write_images(job: Job, writer, maps: dict, envmap, frames, render_frames: li
         writer.write_colour(job.out / "renders" / f"{frame_index:04d}.exr", full, "radiance, clip maximum 1")
 
 
-def describe_capture(job: Job, poses: dict, frames):
-    """Lens, film back and motion of the clip."""
+def describe_capture(job: Job, poses: dict, frames, actions):
+    """Lens, film back and motion of the clip, and of the lids among the facial actions."""
+    from shared.geometry.blend_shapes import LidActions
+    from shared.geometry.eyeballs import pitch_from_rest
     from shared.io.usd_capture import DEFAULT_FILM_WIDTH_MM, UsdCapture
 
     width, height = frames.source_size
+    weights = {}
+    if "lids" in poses and LidActions.of(actions) is not None:
+        pitch = pitch_from_rest(poses["gaze"]) if "gaze" in poses else 0.0 * poses["lids"]
+        weights = LidActions.weights(poses["lids"], pitch)
     intrinsics, film_width = poses["intrinsics"], job.subject.sensor_width_mm or DEFAULT_FILM_WIDTH_MM
     if job.subject.sensor_width_mm is not None and job.subject.focal_length_mm is not None:
         film_width = job.subject.focal_length_mm * width / float(intrinsics[0, 0])  # right for turned clips too
@@ -190,7 +196,7 @@ def describe_capture(job: Job, poses: dict, frames):
                       width=width,
                       height=height, moves=frames.moves, film_width_mm=film_width,
                       light_with_camera=light_moves(job, frames.moves) != frames.moves, eye_turn=poses.get("eye_turn"),
-                      lids=poses.get("lids"))
+                      action_weights=weights)
 
 
 def near_lamp(solve: dict):
@@ -263,7 +269,7 @@ def light_moves(job: Job, moves: str) -> str:
 
 def render_views(job: Job, writer, mesh, eyes, actions, maps: dict, envmap, poses: dict, frames, solve: dict):
     """Writes views/novel_*.exr, views/relit_*.exr and the lights -> the ViewSet; None when switched off."""
-    from shared.geometry.blend_shapes import blinks_of
+    from shared.geometry.blend_shapes import LidActions
     from shared.imaging.turning_eyes import TurningEyes
     from shared.rendering.near_lamp import NearLamp
     from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
@@ -275,7 +281,7 @@ def render_views(job: Job, writer, mesh, eyes, actions, maps: dict, envmap, pose
     views = make_views(
         mesh, maps, envmap, camera_from_head=poses["camera_from_head"], moves=moves, pixels=job.params.view_size,
         held_out=cameras, progress=job.progress, lamp=NearLamp.of_record(solve.get("lamp") or {}),
-        eyes=TurningEyes(mesh, eyes) if eyes else None, blinks=blinks_of(actions),
+        eyes=TurningEyes(mesh, eyes) if eyes else None, lids=LidActions.of(actions),
     )
     (job.out / "views").mkdir()
     pictures = {f"novel_{name}": picture for name, picture in views.novel.items()}
@@ -410,8 +416,8 @@ def run(job: Job) -> None:
             lambda: find_base(job, surface, writer))
     (actions, said_of_them), few, base = share_out(len(work), lambda k: work[k]())
     details = dict(zip(REDUCED_FACES, few, strict=True))
-    asset = describe_asset(job, mesh, eyes, actions, details, base, describe_capture(job, poses, frames), frames,
-                           writer, lamp)
+    capture = describe_capture(job, poses, frames, actions)
+    asset = describe_asset(job, mesh, eyes, actions, details, base, capture, frames, writer, lamp)
     write_assets(job, asset, eyeballs, poses, maps, far)
     views = render_views(job, writer, mesh, eyes, actions, maps, envmap, poses, frames, solve)
     record = run_record(job, mesh, said_of_them, solve, time.perf_counter() - start)

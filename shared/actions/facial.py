@@ -1,7 +1,8 @@
 """The facial actions of a solved head, as blend shapes with ARKit's names.
 
 They come from the head model: carried over to the solved head (transfer), lids kept about the eyeballs (eyelids), skin
-kept from folding over (folds) and lips from passing through each other (lips). The head at rest is the solved one,
+kept from folding over (folds) and lips from passing through each other (lips). Lids that follow the gaze, which the
+model does not have, are made here. The head at rest is the solved one,
 whatever its expression is: eyes that are half shut in it need half of a blink. Eyeballs do not move; they turn as parts
 of their own.
 """
@@ -16,11 +17,14 @@ import numpy as np
 from shared.actions.eyelids import HALF, Eyelids
 from shared.actions.folds import SkinFolds
 from shared.actions.lips import LipContact
-from shared.actions.names import named_actions
+from shared.actions.names import in_order, named_actions
 from shared.actions.transfer import carried, local_similarities
-from shared.geometry.blend_shapes import BLINKS, BlendShape
+from shared.geometry.blend_shapes import BLINKS, LOOK_RAD, LOOKS_DOWN, LOOKS_UP, BlendShape
 from shared.tracking.head_model import HeadModel
 
+LOOKS = {name: (eye, sign * LOOK_RAD) for sign, names in ((-1.0, LOOKS_DOWN), (1.0, LOOKS_UP))
+         for eye, name in enumerate(names)}  # fmt: skip
+"""Of each of these: which eye, and how far up its lids follow the gaze."""
 LEAST_MM = 0.05
 """A vertex moves if it does so by more than this: a quarter of a pixel where a face is 1000 pixels wide."""
 HIDDEN = ("eyes", "eye_sockets", "inner_mouth")
@@ -55,13 +59,15 @@ def facial_actions(
     maps, lids = _maps(model, levels, vertices), Eyelids.of(finer, vertices, splits=len(levels) - 1)
     lips, surface = LipContact.of(finer, vertices), finer.surface(vertices)
     still, skin = surface.vertices_of(("eyes",)), SkinFolds.of(vertices, faces, ~surface.vertices_of(TOUCHING))
-    shapes = []
-    for name, moves in named_actions(finer).items():
+    shapes, known = [], named_actions(finer)
+    for name in in_order((*known, *LOOKS)) if lids is not None else known:
         if only is not None and name not in only:
             continue
-        moved, between = np.where(still[:, None], 0.0, carried(moves, maps)), ()
-        if lids is not None and name in BLINKS:
-            moved, half = lids.blink(BLINKS.index(name), moves, moved)
+        moved, between = np.where(still[:, None], 0.0, carried(known[name], maps)) if name in known else None, ()
+        if name in LOOKS:
+            moved = skin.smoothed(lids.following(*LOOKS[name]))
+        elif lids is not None and name in BLINKS:
+            moved, half = lids.blink(BLINKS.index(name), known[name], moved)
             between = ((HALF, half),)
         elif lids is not None:
             moved = skin.smoothed(lids.clear_of_balls(moved))

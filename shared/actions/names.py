@@ -6,6 +6,8 @@ the face, and an action of which the model has one side only is mirrored for the
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -51,8 +53,13 @@ def named_actions(model: HeadModel) -> dict[str, np.ndarray]:
             found[arkit_name(name)] = moves
         if name in MIRRORED:
             found[arkit_name(MIRRORED[name])] = _mirrored(model.template, moves)
+    return {name: found[name] for name in in_order(found)}
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """In ARKit's order, then those that ARKit does not have."""
     order = {name: k for k, name in enumerate(ARKIT_NAMES)}
-    return {name: found[name] for name in sorted(found, key=lambda name: (order.get(name, len(order)), name))}
+    return sorted(names, key=lambda name: (order.get(name, len(order)), name))
 
 
 def _left_share(x: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +11,11 @@ from shared.geometry.mesh import Mesh, shading_normals, vertex_normals
 
 BLINKS = "eyeBlinkRight", "eyeBlinkLeft"
 """Names of the actions that shut the right and the left eye."""
+LOOKS_DOWN, LOOKS_UP = ("eyeLookDownRight", "eyeLookDownLeft"), ("eyeLookUpRight", "eyeLookUpLeft")
+"""Of those with which the lids of the right and the left eye follow its gaze."""
+LOOK_RAD = np.radians(30.0)
+"""How far the gaze is down or up where the weight of these is 1."""
+LID_ACTIONS = (*BLINKS, *LOOKS_DOWN, *LOOKS_UP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,16 +85,28 @@ def with_normals(shapes: Sequence[BlendShape], mesh: Mesh) -> tuple[BlendShape, 
     return tuple(found)
 
 
-def blink_weights(names: Sequence[str], lids: np.ndarray) -> np.ndarray:
-    """[F, len(names)] weights of actions, 0 but for the blinks, which shut each eye as far as lids [F, 2] say."""
-    weights = np.zeros((len(lids), len(names)))
-    for eye, name in enumerate(BLINKS):
-        if name in names:
-            weights[:, list(names).index(name)] = lids[:, eye]
-    return weights
+@dataclass(frozen=True, eq=False)
+class LidActions:
+    """The actions that move the lids of the right and the left eye, LID_ACTIONS, by their names."""
 
+    shapes: Mapping[str, BlendShape]
 
-def blinks_of(shapes: Sequence[BlendShape]) -> tuple[BlendShape, ...]:
-    """Those that shut the right and the left eye; none where one of them is missing."""
-    named = {shape.name: shape for shape in shapes}
-    return tuple(named[name] for name in BLINKS) if named.keys() >= set(BLINKS) else ()
+    @classmethod
+    def of(cls, shapes: Sequence[BlendShape]) -> LidActions | None:
+        """None where one is missing."""
+        named = {shape.name: shape for shape in shapes}
+        return cls({name: named[name] for name in LID_ACTIONS}) if named.keys() >= set(LID_ACTIONS) else None
+
+    @staticmethod
+    def weights(shut: np.ndarray, pitch: np.ndarray) -> dict[str, np.ndarray]:
+        """{name: weight [F] in [0, 1]}; shut [F, 2]: how far each eye is; pitch [F, 2] radians: how far its gaze is up
+        from where it is with lids at rest. Lids follow the gaze as far as they are open."""
+        look = np.clip(pitch / LOOK_RAD, -1.0, 1.0) * (1.0 - shut)
+        kinds = zip((BLINKS, LOOKS_DOWN, LOOKS_UP), (shut, np.maximum(-look, 0.0), np.maximum(look, 0.0)), strict=True)
+        return {name: kind[:, eye] for names, kind in kinds for eye, name in enumerate(names)}
+
+    def moved(self, vertices: np.ndarray, shut: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+        """Vertices [V, 3] mm with the lids as weights has them; shut [2], pitch [2]."""
+        for name, weight in self.weights(shut[None], pitch[None]).items():
+            vertices = self.shapes[name].applied(vertices, float(weight[0]))
+        return vertices

@@ -34,6 +34,27 @@ class Eyeball:
     radius: float
 
 
+def gaze_between(gaze: np.ndarray) -> np.ndarray:
+    """Gaze [F, 2, 2] of frames in order, NaN where an eye is shut or not seen -> as the frames before and after have it
+    there, and as the other eye has it where one is never seen; NaN where neither is."""
+    filled, known = np.array(gaze, np.float64), np.isfinite(gaze).all(2)
+    for side in np.nonzero(known.any(0))[0]:
+        frames = np.nonzero(known[:, side])[0]
+        filled[:, side] = np.stack([np.interp(np.arange(len(gaze)), frames, values) for values in
+                                    gaze[frames, side].T], axis=1)  # fmt: skip
+    return np.where(known.any(0)[:, None], filled, filled[:, ::-1])
+
+
+def pitch_from_rest(gaze: np.ndarray) -> np.ndarray:
+    """[F, 2] radians: how far both eyes' gaze [F, 2, 2], see gaze_between, is up from the middle of what is known of
+    it, where a clip's lids are at rest; 0 where nothing is."""
+    known = np.isfinite(gaze).all((1, 2))
+    if not known.any():
+        return np.zeros(gaze.shape[:2])
+    pitch = gaze_between(gaze)[:, :, 1].mean(1)
+    return np.repeat(pitch[:, None] - np.median(pitch[known]), 2, axis=1)
+
+
 def eyeballs_of(surface: Surface) -> tuple[Eyeball, Eyeball] | None:
     """The right and the left eyeball of a head; None where the mesh has no segment `eyes`, or not one on each side."""
     if surface.face_segment is None or "eyes" not in surface.segment_names:

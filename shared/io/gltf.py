@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from shared.geometry.blend_shapes import BLINKS, BlendShape, blink_weights
+from shared.geometry.blend_shapes import BLINKS, BlendShape
 from shared.geometry.eyeballs import EYE_ROUGHNESS, TEAR_FILM_IOR
 from shared.geometry.mesh import tangent_frames, unique_pairs, uv_tangents
 from shared.geometry.parts import HEAD, RigidPart
@@ -259,8 +259,8 @@ def _animation(buffer: _Buffer, capture: UsdCapture, eye_count: int, targets: Se
         if len(frames):
             open_eyes = buffer.array(_seconds(capture, frames), bounds=True)
             tracks.append((_FIRST_EYE + k, "rotation", open_eyes, buffer.array(_quaternions(rotations))))
-    if targets and capture.lids is not None and capture.lids.any():
-        tracks.append((0, "weights", time, buffer.array(_target_weights(targets, capture.lids).ravel())))
+    if targets and capture.moves_actions:
+        tracks.append((0, "weights", time, buffer.array(_target_weights(targets, capture).ravel())))
     return {
         "name": "clip",
         "samplers": [{"input": times, "output": values, "interpolation": "LINEAR"} for _, _, times, values in tracks],
@@ -269,9 +269,9 @@ def _animation(buffer: _Buffer, capture: UsdCapture, eye_count: int, targets: Se
     }
 
 
-def _target_weights(targets: Sequence[str], lids: np.ndarray) -> np.ndarray:
-    """[F, len(targets)]: the blinks' own and those of their in-betweens; lids [F, 2] as in UsdCapture."""
-    weights = blink_weights(targets, lids)
+def _target_weights(targets: Sequence[str], capture: UsdCapture) -> np.ndarray:
+    """[F, len(targets)]: those of the clip's actions, and of the blinks' in-betweens."""
+    weights = capture.weights_of(targets)
     for name in BLINKS:
         if f"{name}_50" in targets:
             weights[:, targets.index(f"{name}_50")] = 1.0 - np.abs(2.0 * weights[:, targets.index(name)] - 1.0)

@@ -6,8 +6,8 @@
       skeleton          Skeleton, as UsdSkel wants one; its only joint, the head itself, moves nothing
         actions         SkelAnimation with the weight of each action, 0: the head at rest
 
-The clip's blinks are time samples of these weights. Whoever animates the face sets `blendShapeWeights` of `actions`, or
-writes a SkelAnimation of their own and binds that one to the skeleton.
+The clip's blinks, and lids that follow the gaze, are time samples of these weights. Whoever animates the face sets
+`blendShapeWeights` of `actions`, or writes a SkelAnimation of their own and binds that one to the skeleton.
 
 Reference: UsdSkel, Schemas (Blend Shapes).
 """
@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from shared.geometry.blend_shapes import BlendShape, blink_weights
+from shared.geometry.blend_shapes import BlendShape
 from shared.io.usd_capture import UsdCapture
 
 SKELETON, ANIMATION, JOINT = "skeleton", "actions", "head"
@@ -42,14 +42,14 @@ def define_skeleton(stage: Usd.Stage, root: Sdf.Path, shapes: Sequence[BlendShap
 
 
 def set_weights(root: Usd.Prim, shapes: Sequence[BlendShape], capture: UsdCapture | None) -> None:
-    """The head at rest; capture: whose blinks become time samples, None: no one's. root: the SkelRoot."""
+    """The head at rest; capture: whose actions become time samples, None: no one's. root: the SkelRoot."""
     path = root.GetPath().AppendPath(f"{SKELETON}/{ANIMATION}")
     weights = UsdSkel.Animation(root.GetStage().GetPrimAtPath(path)).GetBlendShapeWeightsAttr()
     weights.Set(Vt.FloatArray(len(shapes), 0.0))
-    if capture is None or capture.lids is None or not capture.lids.any():
+    if capture is None or not capture.moves_actions:
         return
-    blinks = blink_weights([shape.name for shape in shapes], capture.lids).astype(np.float32)
-    for time, row in zip(capture.frame_index, blinks, strict=True):
+    moving = capture.weights_of([shape.name for shape in shapes]).astype(np.float32)
+    for time, row in zip(capture.frame_index, moving, strict=True):
         weights.Set(Vt.FloatArray.FromNumpy(row), float(time))
 
 

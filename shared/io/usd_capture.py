@@ -9,8 +9,8 @@ towards +z, pi/2 towards +x) is the layout of Limn's environment maps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, Vt
@@ -42,7 +42,7 @@ class UsdCapture:
     moves: "head" or "camera", what turned while the light stood still. film_width_mm: width of the sensor
     that the full frame shows. light_with_camera: the camera moved and carried the light along. eye_turn [F, 2, 2]
     radians: how the right and the left eyeball are turned (shared/geometry/eyeballs.py), NaN while shut; None where it
-    is not known. lids [F, 2] in [0, 1]: how far the right and the left eye are shut, None where that is not known.
+    is not known. action_weights {name: [F] in [0, 1]}: of the facial actions that move; empty where none does.
     """
 
     camera_from_head: np.ndarray
@@ -55,7 +55,17 @@ class UsdCapture:
     film_width_mm: float = DEFAULT_FILM_WIDTH_MM
     light_with_camera: bool = False
     eye_turn: np.ndarray | None = None
-    lids: np.ndarray | None = None
+    action_weights: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def moves_actions(self) -> bool:
+        """Does the face itself move in the clip?"""
+        return any(weights.any() for weights in self.action_weights.values())
+
+    def weights_of(self, names: Sequence[str]) -> np.ndarray:
+        """[F, len(names)] weights of the actions of these names, 0 of those that do not move."""
+        still = np.zeros(len(self.frame_index))
+        return np.stack([self.action_weights.get(name, still) for name in names], axis=1)
 
 
 @dataclass(frozen=True)

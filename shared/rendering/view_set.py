@@ -15,7 +15,8 @@ ROUGHNESSES = (0.1, 0.3, 0.5, 0.8)
 class ViewCamera:
     """camera_from_head [4, 4] mm, intrinsics [3, 3] px of a picture of size (width, height); gaze [2, 2] radians: how
     the eyeballs are turned in the head that it looks at, None: straight ahead; lids [2]: how far its right and left eye
-    are shut, None: as the mesh has them; gain [3]: of its exposure, None: 1."""
+    are shut, None: as the mesh has them; gain [3]: of its exposure, None: 1; pitch [2] radians: how far these eyes look
+    up from where they do with lids at rest, None: not at all."""
 
     camera_from_head: np.ndarray
     intrinsics: np.ndarray
@@ -23,6 +24,7 @@ class ViewCamera:
     gaze: np.ndarray | None = None
     gain: np.ndarray | None = None
     lids: np.ndarray | None = None
+    pitch: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

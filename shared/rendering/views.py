@@ -12,7 +12,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shared.compute.threads import share_out
-from shared.geometry.blend_shapes import BlendShape
+from shared.geometry.blend_shapes import LidActions
+from shared.geometry.eyeballs import gaze_between, pitch_from_rest
 from shared.geometry.mesh import Mesh, interpolate, normalised
 from shared.geometry.raycast import RAY_START_MM, camera_hits
 from shared.geometry.transforms import camera_centres, rigid, world_from_head
@@ -54,16 +55,16 @@ def make_views(
     progress: Callable | None = None,
     lamp: NearLamp | None = None,
     eyes: TurningEyes | None = None,
-    blinks: Sequence[BlendShape] = (),
+    lids: LidActions | None = None,
 ) -> ViewSet:
     """All of them, pixels wide. maps and progress as for HeadViews; envmap [H, 2 H, 3], camera_from_head [F, 4, 4] and
     moves of the clip; held_out: frames of the clip to re-render, with their cameras; lamp: of its light, where it
     stands near: for those frames, while from elsewhere the head is seen under the light as its mean place has it;
-    eyes: those of the mesh, which turn with the cameras' gaze; blinks: see HeadViews."""
+    eyes: those of the mesh, which turn with the cameras' gaze; lids: see HeadViews."""
     around = [orbit_camera(mesh, *place, pixels) for place in NOVEL_VIEWS.values()]
     camera, front = orbit_camera(mesh, RELIT_YAW_DEG, 0.0, pixels), orbit_camera(mesh, 0.0, 0.0, pixels)
     cameras = [*around, camera, front, *held_out.values()]
-    views = HeadViews(mesh, maps, VIEW_SIZES, cameras, progress, eyes=eyes, blinks=blinks)
+    views = HeadViews(mesh, maps, VIEW_SIZES, cameras, progress, eyes=eyes, lids=lids)
     novel = views.render(clip_light(envmap, camera_from_head, moves), around)
     again = views.render(envmap, list(held_out.values()), moves, fade=False, lamp=lamp) if held_out else []
     covered = share_out(len(ROUGHNESSES), lambda k: views.visibility(front, ROUGHNESSES[k]))
@@ -108,9 +109,11 @@ def held_out_cameras(
 
 def clip_camera(poses: Mapping[str, np.ndarray], f: int, lens: np.ndarray, size: tuple[int, int]) -> ViewCamera:
     """Camera f of a poses.npz with a lens [3, 3] and a picture's size (width, height), px, with gaze, gain and lids if
-    it has them."""
-    gaze, gain, lids = (poses[name][f] if name in poses else None for name in ("eye_turn", "gain", "lids"))
-    return ViewCamera(poses["camera_from_head"][f], lens, size, gaze, gain, lids)
+    it has them. Shut eyes, which the lids may leave open a little, look as they do before and after."""
+    gain, lids = (poses[name][f] if name in poses else None for name in ("gain", "lids"))
+    gaze = gaze_between(poses["eye_turn"])[f] if "eye_turn" in poses else None
+    pitch = pitch_from_rest(poses["gaze"])[f] if "gaze" in poses else None
+    return ViewCamera(poses["camera_from_head"][f], lens, size, gaze, gain, lids, pitch)
 
 
 def frontal_frame(camera_from_head: np.ndarray) -> int:
@@ -130,9 +133,8 @@ class HeadViews:
     maps: diffuse_albedo [S, S, 3], specular_intensity [S, S], roughness [S, S]. cameras: all that will look at it, so
     that only what they can see is traced; none: everything; only [V]: vertices that matter, all by default.
     progress(items, label) wraps the trace. light_resolution: edge of the cubemap that lights are seen through; deep:
-    see VertexShading; over 1 where cavities are exact; eyes: those of the mesh, None: they do not turn; blinks: of the
-    right and the left eye, blend shapes of the mesh, with which lids move as cameras say, none: they do not. Light on
-    them stays what it is on open ones.
+    see VertexShading; over 1 where cavities are exact; eyes: those of the mesh, None: they do not turn; lids: actions
+    of the mesh with which they move as cameras say, None: they do not. Light on them stays what it is on open ones.
     """
 
     def __init__(
@@ -146,9 +148,9 @@ class HeadViews:
         deep: float = DEEP,
         only: np.ndarray | None = None,
         eyes: TurningEyes | None = None,
-        blinks: Sequence[BlendShape] = (),
+        lids: LidActions | None = None,
     ):
-        self.light_resolution, self.deep, self.eyes, self.blinks = light_resolution, deep, eyes, blinks
+        self.light_resolution, self.deep, self.eyes, self.lids = light_resolution, deep, eyes, lids
         self.viewer = SurfaceViewer.of(mesh)
         self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"])
         self.precomputed = precompute_transfer(self.viewer, sizes or Sizes())
@@ -219,20 +221,21 @@ class HeadViews:
         pictures = []
         for k, camera in enumerate(cameras):
             picture, covered = render_frame(
-                self._blinking(camera), shading, self.maps, k, camera.camera_from_head, camera.intrinsics, camera.size,
+                self._with_lids(camera), shading, self.maps, k, camera.camera_from_head, camera.intrinsics, camera.size,
                 eyes=self._looking(camera),
             )
             picture = picture if camera.gain is None else picture * camera.gain
             pictures.append(picture * covered[..., None] if fade else picture)
         return pictures
 
-    def _blinking(self, camera: ViewCamera) -> SurfaceViewer:
+    def _with_lids(self, camera: ViewCamera) -> SurfaceViewer:
         """The head with its lids as they are before a camera."""
-        if not self.blinks or camera.lids is None or not np.any(camera.lids):
+        if self.lids is None or camera.lids is None:
             return self.viewer
-        vertices = self.viewer.mesh.vertices
-        for blink, shut in zip(self.blinks, camera.lids, strict=True):
-            vertices = blink.applied(vertices, shut)
+        pitch = np.zeros(2) if camera.pitch is None else camera.pitch
+        if not (np.any(camera.lids) or np.any(pitch)):
+            return self.viewer
+        vertices = self.lids.moved(self.viewer.mesh.vertices, camera.lids, pitch)
         return SurfaceViewer.of(self.viewer.mesh.replace(vertices=vertices))
 
     def _looking(self, camera: ViewCamera) -> LookingEyes | None:

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shared.actions.eyelids import CLEAR_MM
+from shared.actions.eyelids import CLEAR_MM, FOLLOW
 from shared.actions.facial import facial_actions
-from shared.geometry.blend_shapes import BLINKS
+from shared.geometry.blend_shapes import BLINKS, LOOK_RAD, LOOKS_DOWN, LOOKS_UP
 from shared.geometry.eyeballs import eyeballs_of
 from shared.geometry.raycast import RayScene
 from shared.tracking.fit_lids import LidMargins
@@ -100,6 +100,21 @@ def test_other_actions_keep_lids_out_of_the_balls(solved):
             lengths = [np.linalg.norm(shape.applied(vertices, weight)[own] - ball.centre, axis=1)
                        for weight in (0.25, 0.5, 0.75, 1.0)]
             assert np.min(lengths) > ball.radius - 0.05, name
+
+
+@pytest.mark.parametrize("names, sign", [(LOOKS_DOWN, -1.0), (LOOKS_UP, 1.0)], ids=["down", "up"])
+def test_lids_follow_the_gaze(solved, eye, names, sign):
+    """In the middle by their shares of the angle, in the corners not at all; the other eye stays as it is."""
+    which, ball, _ = eye
+    shape, vertices = solved.shapes[names[which]], solved.surface.mesh.vertices
+    moved = shape.applied(vertices, 1.0)
+    margins = LidMargins.of(solved.model, splits=1)
+    for loop, share in zip(margins.loops[which], FOLLOW, strict=True):
+        turned = polar(moved[loop], ball)[1] - polar(vertices[loop], ball)[1]
+        assert turned[len(loop) // 2] == pytest.approx(sign * share * LOOK_RAD, rel=0.2)
+        assert np.abs(turned[[0, -1]]).max() < 0.02
+    other = np.sign(vertices[shape.vertices, 0]) != np.sign(ball.centre[0])
+    assert np.linalg.norm(shape.offsets[other], axis=1).max(initial=0.0) < 0.05
 
 
 def test_eyes_that_are_shut_need_no_blink(model, solved):

@@ -3,7 +3,16 @@
 import numpy as np
 from toy_result import toy_mesh
 
-from shared.geometry.blend_shapes import BLINKS, BlendShape, blink_weights, blinks_of, with_normals
+from shared.geometry.blend_shapes import (
+    BLINKS,
+    LID_ACTIONS,
+    LOOK_RAD,
+    LOOKS_DOWN,
+    LOOKS_UP,
+    BlendShape,
+    LidActions,
+    with_normals,
+)
 from shared.geometry.mesh import Mesh, shading_normals
 
 MOVES = np.array([[0.0, 0, 0], [4.0, 0, 0], [0.0, 2, 0], [0.004, 0, 0], [0.0, 0, 1]])
@@ -72,10 +81,18 @@ def test_normals_added_are_those_of_the_moved_mesh():
     assert not squeezed.normals.any()
 
 
-def test_blinks_are_found_by_name_and_weighed_by_the_lids():
-    shapes = [BlendShape.of(name, np.eye(3), 0.0) for name in ("jawOpen", "eyeBlinkLeft", "eyeBlinkRight")]
-    assert [shape.name for shape in blinks_of(shapes)] == list(BLINKS)
-    assert blinks_of(shapes[:2]) == ()
-    lids = np.array([[0.0, 0.0], [0.25, 1.0]])  # right, left
-    np.testing.assert_array_equal(blink_weights([shape.name for shape in shapes], lids), [[0, 0, 0], [0, 1.0, 0.25]])
-    np.testing.assert_array_equal(blink_weights(["jawOpen"], lids), np.zeros((2, 1)))
+def test_lids_blink_and_follow_the_gaze_as_far_as_they_are_open():
+    moves = np.random.default_rng(5).normal(size=(6, 4, 3))
+    shapes = [BlendShape.of(name, own, 0.0) for name, own in zip(LID_ACTIONS, moves, strict=True)]
+    lids = LidActions.of(shapes[::-1])
+    shut = np.array([[0.0, 0.0], [0.25, 1.0], [0.0, 0.5], [0.0, 0.0]])
+    pitch = LOOK_RAD * np.array([[0.0, 0.0], [0.5, 0.5], [-0.4, -0.4], [2.0, -2.0]])
+    weights = lids.weights(shut, pitch)
+    assert list(weights) == list(LID_ACTIONS)
+    np.testing.assert_allclose(np.stack([weights[name] for name in BLINKS], axis=1), shut)
+    down, up = (np.stack([weights[name] for name in names], axis=1) for names in (LOOKS_DOWN, LOOKS_UP))
+    np.testing.assert_allclose(up, [[0.0, 0.0], [0.375, 0.0], [0.0, 0.0], [1.0, 0.0]])
+    np.testing.assert_allclose(down, [[0.0, 0.0], [0.0, 0.0], [0.4, 0.2], [0.0, 1.0]])
+    moved = lids.moved(np.zeros((4, 3)), shut[2], pitch[2])
+    np.testing.assert_allclose(moved, 0.5 * moves[1] + 0.4 * moves[2] + 0.2 * moves[3], atol=1e-6)
+    assert LidActions.of(shapes[:5]) is None

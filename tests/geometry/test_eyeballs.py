@@ -7,10 +7,12 @@ from shapes import sphere
 from shared.geometry.eyeballs import (
     eyeballs_of,
     fit_sphere,
+    gaze_between,
     gaze_direction,
     gaze_rotation,
     gaze_shown,
     gaze_towards,
+    pitch_from_rest,
 )
 from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface
@@ -83,3 +85,21 @@ def test_an_iris_beside_the_mesh_s_eyeball_is_shown_on_the_line_of_sight():
     past = right.centre + [[3.0 * right.radius, 0.0, 0.0]]
     limb = gaze_shown(right, past, right.centre + [[0.0, 0.0, 500.0]])
     assert limb[0, 0] == pytest.approx(np.pi / 2, abs=0.1)
+
+
+def test_a_shut_eye_looks_as_it_does_before_and_after():
+    """And as the other one where it is never seen; where neither is, nobody knows."""
+    gaze = np.full((5, 2, 2), np.nan)
+    gaze[1, 0], gaze[3, 0] = [0.1, -0.2], [0.3, 0.2]
+    found = gaze_between(gaze)
+    np.testing.assert_allclose(found[:, 0], [[0.1, -0.2], [0.1, -0.2], [0.2, 0.0], [0.3, 0.2], [0.3, 0.2]])
+    np.testing.assert_array_equal(found[:, 1], found[:, 0])
+    assert np.isnan(gaze_between(np.full((3, 2, 2), np.nan))).all()
+
+
+def test_lids_are_at_rest_in_the_middle_of_what_is_known_of_the_gaze():
+    gaze = np.zeros((5, 2, 2))
+    gaze[:, :, 1] = np.array([0.0, 0.1, np.nan, 0.3, 0.1])[:, None] + [0.02, -0.02]
+    expected = np.array([-0.1, 0.0, 0.1, 0.2, 0.0])[:, None] * np.ones(2)
+    np.testing.assert_allclose(pitch_from_rest(gaze), expected, atol=1e-12)
+    np.testing.assert_array_equal(pitch_from_rest(np.full((3, 2, 2), np.nan)), np.zeros((3, 2)))

@@ -138,15 +138,15 @@ def test_the_layered_asset_is_sound(opened, tmp_path):
 
 @pytest.mark.parametrize("layers", [write_single_layer, write_head_usda])
 def test_the_clip_blinks_and_the_still_head_does_not(tmp_path, layers):
-    own, lids = asset(eyes=True), np.linspace(0.0, 1.0, 2 * len(FRAMES)).reshape(-1, 2)
-    own = replace(own, capture=replace(own.capture, lids=lids))
+    own, left = asset(eyes=True), np.linspace(0.0, 1.0, len(FRAMES))
+    own = replace(own, capture=replace(own.capture, action_weights={"eyeBlinkLeft": left}))
     layers(tmp_path / "head.usda" if layers is write_single_layer else tmp_path, own)
     stage = Usd.Stage.Open(str(tmp_path / "head.usda"))
     root = stage.GetDefaultPrim()
     weights = UsdSkel.Animation(root.GetPrimAtPath("geo/skeleton/actions")).GetBlendShapeWeightsAttr()
     assert weights.GetTimeSamples() == [float(frame) for frame in FRAMES]
-    for frame, (_, left) in zip(FRAMES, lids, strict=True):
-        np.testing.assert_allclose(weights.Get(float(frame)), [0.0, left], atol=1e-7)
+    for frame, weight in zip(FRAMES, left, strict=True):
+        np.testing.assert_allclose(weights.Get(float(frame)), [0.0, weight], atol=1e-7)
     head, blink = head_of(stage), head_actions(own)[1]
     rest = np.array(head.GetPointsAttr().Get(), np.float64)
     assert UsdSkel.BakeSkinning(UsdSkel.Root(root.GetPrimAtPath("geo")))

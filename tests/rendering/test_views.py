@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from shapes import nods, sphere
 
-from shared.geometry.blend_shapes import BlendShape
+from shared.geometry.blend_shapes import LID_ACTIONS, LOOK_RAD, BlendShape, LidActions
 from shared.geometry.transforms import project, rotation_from_vector
 from shared.io.arrays import load_arrays, read_json
 from shared.io.images import read_exr
@@ -179,17 +179,21 @@ def test_agrees_with_the_solvers_own_render(tiny_run):
 
 
 def test_lids_move_as_a_camera_says():
-    """Two halves of a ball that blinks take away: the picture shrinks on the side of the eye that is shut."""
+    """Two halves of a ball that blinks take away: the picture shrinks on the side of the eye that is shut, and grows
+    where the gaze goes up."""
     mesh = ball()
     right = np.where(mesh.vertices[:, :1] < -20.0, [[40.0, 0.0, 0.0]], 0.0)
     left = np.where(mesh.vertices[:, :1] > 20.0, [[-40.0, 0.0, 0.0]], 0.0)
-    blinks = BlendShape.of("right", right, 0.0), BlendShape.of("left", left, 0.0)
-    views, camera = HeadViews(mesh, ball_maps(0.0), SIZES, blinks=blinks), orbit_camera(mesh, 0.0, 0.0, PIXELS)
-    cameras = [camera, *(replace(camera, lids=np.array(lids)) for lids in ([0.0, 0.0], [1.0, 0.0], [0.0, 0.5]))]
-    rest, still, one, half = views.render(even_light(), cameras)
+    named = zip(LID_ACTIONS, (right, left, right, left, -right, -left), strict=True)
+    lids = LidActions.of([BlendShape.of(name, moves, 0.0) for name, moves in named])
+    views, camera = HeadViews(mesh, ball_maps(0.0), SIZES, lids=lids), orbit_camera(mesh, 0.0, 0.0, PIXELS)
+    cameras = [camera, *(replace(camera, lids=np.array(own)) for own in ([0.0, 0.0], [1.0, 0.0], [0.0, 0.5]))]
+    cameras.append(replace(cameras[1], pitch=np.array([0.25 * LOOK_RAD, 0.0])))
+    rest, still, one, half, wider = views.render(even_light(), cameras)
     np.testing.assert_array_equal(rest, still)
-    columns = [np.nonzero((picture > 0.0).any((0, 2)))[0] for picture in (rest, one, half)]
+    columns = [np.nonzero((picture > 0.0).any((0, 2)))[0] for picture in (rest, one, half, wider)]
     millimetre = (columns[0][-1] - columns[0][0]) / (2.0 * RADIUS)
     assert columns[1][0] - columns[0][0] == pytest.approx(40.0 * millimetre, abs=2)
     assert columns[1][-1] == columns[0][-1]
     assert columns[0][-1] - columns[2][-1] == pytest.approx(20.0 * millimetre, abs=2)
+    assert columns[0][0] - columns[3][0] == pytest.approx(10.0 * millimetre, abs=2)

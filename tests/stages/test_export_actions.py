@@ -39,7 +39,7 @@ def test_the_asset_has_arkits_names(exported, file):
     head = stage.GetDefaultPrim().GetPrimAtPath("geo/head")
     names = list(UsdSkel.BindingAPI(head).GetBlendShapesAttr().Get())
     assert names == read_json(exported[True].out / "run.json")["actions"]["names"]
-    assert len(names) == 29 and set(names) <= set(ARKIT_NAMES)
+    assert len(names) == 33 and set(names) <= set(ARKIT_NAMES)
     assert morph_names(exported[True].out / "head.glb") == [*names, "eyeBlinkLeft_50", "eyeBlinkRight_50"]
     halves = [UsdSkel.BlendShape(head.GetChild(name)).GetInbetweens() for name in names]
     assert [name for name, found in zip(names, halves, strict=True) if found] == ["eyeBlinkLeft", "eyeBlinkRight"]

@@ -130,7 +130,7 @@ def test_it_has_the_actions(exported):
         offsets = np.array(UsdSkel.BlendShape(head.GetChild("jawOpen")).GetOffsetsAttr().Get())
         found[detail] = names, np.linalg.norm(offsets, axis=1).max()
         assert UsdSkel.BlendShape(head.GetChild("eyeBlinkLeft")).GetInbetweens()
-    assert found["base"][0] == found["full"][0] and len(found["full"][0]) == 29
+    assert found["base"][0] == found["full"][0] and len(found["full"][0]) == 33
     assert found["base"][1] == pytest.approx(found["full"][1], rel=0.03)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from shared.actions.facial import facial_actions
 from shared.errors import InputError
-from shared.geometry.blend_shapes import BLINKS, blinks_of
+from shared.geometry.blend_shapes import LID_ACTIONS, LidActions
 from shared.geometry.mesh import interpolate
 from shared.geometry.raycast import camera_hits
 from shared.geometry.surface import Surface
@@ -69,8 +69,9 @@ class SolvedClip:
         cameras = [item.camera for item in self.held_out]
         turn = any(camera.gaze is not None for camera in cameras)
         eyes = TurningEyes.of(Surface(self.asset.mesh, segment, tuple(names))) if turn else None
-        blinks = facial_actions(load_head_model(), self.asset.mesh.vertices, self.asset.mesh.faces, BLINKS)
-        self.views = HeadViews(self.asset.mesh, self.asset.maps, SIZES, cameras, eyes=eyes, blinks=blinks_of(blinks))
+        moving = facial_actions(load_head_model(), self.asset.mesh.vertices, self.asset.mesh.faces, LID_ACTIONS)
+        lids = LidActions.of(moving)
+        self.views = HeadViews(self.asset.mesh, self.asset.maps, SIZES, cameras, eyes=eyes, lids=lids)
 
     def compared(self) -> list[HeldOutFrame]:
         """Every held-out frame beside its re-render under the clip's light."""

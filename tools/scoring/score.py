@@ -31,8 +31,10 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from shared.actions.facial import facial_actions
 from shared.errors import InputError
-from shared.geometry.eyeballs import eyeballs_of
+from shared.geometry.blend_shapes import LID_ACTIONS, LidActions
+from shared.geometry.eyeballs import eyeballs_of, pitch_from_rest
 from shared.geometry.mesh import Mesh
 from shared.geometry.raycast import RayScene
 from shared.geometry.surface import Surface
@@ -40,6 +42,7 @@ from shared.imaging.color import decode_srgb
 from shared.io.arrays import load_arrays, read_json, write_json
 from shared.io.images import read_exr, read_png
 from shared.io.meshes import load_mesh, read_obj
+from shared.tracking.models import load_head_model
 from tools.scoring import align, gaze, labels, lid_margins, measures
 from tools.scoring.buffers import BufferRenderer
 from tools.scoring.table import table
@@ -195,10 +198,12 @@ def read_render(export: Path, frame: int) -> np.ndarray | None:
 
 
 def score_eyes(subject: Path, export: Path, truth: dict[str, np.ndarray], truth_from_result: np.ndarray) -> dict:
-    """{gaze, rerender_eyes} against what gt/poses.npz says of living eyes; gaze is None where the result has none, and
-    rerender_eyes is left out where it renders no frame that holds truth. truth_from_result [3, 3]."""
+    """{gaze, iris_px, rerender_eyes, lid_margins_mm} against what gt/poses.npz says of living eyes; gaze is None where
+    the result has none, the others are left out where there is nothing to compare. truth_from_result [3, 3]."""
     found = gaze.found_gaze(export)
     scores: dict = {"gaze": gaze.gaze_errors(truth["gaze"], found, truth_from_result) if found else None}
+    if (irises := gaze.iris_errors_px(truth, export.parent / "work" / "track_landmarks")) is not None:
+        scores["iris_px"] = irises
     pairs = {}
     for frame in truth["gt_frames"].tolist():
         stem, render = subject / "gt" / "frames" / f"{frame:04d}", read_render(export, frame)
@@ -218,8 +223,8 @@ def score_eyes(subject: Path, export: Path, truth: dict[str, np.ndarray], truth_
 
 
 def score_lids(subject: Path, export: Path, truth: dict[str, np.ndarray]) -> dict | None:
-    """How far the mesh's lids are from the truth's, see lid_margins, in frames with open eyes; None where the stages'
-    folders are not beside the export, or the head has no eyeballs."""
+    """How far the mesh's lids, as the export moves them, are from the truth's, see lid_margins, in frames with open
+    eyes; None where the stages' folders are not beside the export, or the head has no eyeballs."""
     mesh_path = export.parent / "work" / "inverse_render" / "mesh.npz"
     tracking_path = export.parent / "work" / "track_landmarks" / "tracking.json"
     if not (mesh_path.exists() and tracking_path.exists()):
@@ -228,20 +233,36 @@ def score_lids(subject: Path, export: Path, truth: dict[str, np.ndarray]) -> dic
     surface = Surface(load_mesh(mesh_path), segment, names)
     if eyeballs_of(surface) is None:
         return None
-    scene, eyes = RayScene(surface.mesh.vertices, surface.mesh.faces), surface.faces_of(("eyes",))
+    eyes, scene_of = surface.faces_of(("eyes",)), _scenes_with_lids(export, surface)
     result, radius, pairs = load_result(export, camera_intrinsics(subject)), float(truth["eyeball_radius"]), []
     for frame in truth["gt_frames"].tolist():
         if frame not in result.poses or np.isnan(truth["gaze"][frame]).any():
             continue
         depth = read_exr(subject / "gt" / "frames" / f"{frame:04d}_depth.exr")
         pose, lens = truth["camera_from_head"][frame], truth["K"]
-        found = lid_margins.opening_of_result(scene, eyes, result.poses[frame], result.intrinsics, depth.shape[::-1])
+        found = lid_margins.opening_of_result(
+            scene_of(frame), eyes, result.poses[frame], result.intrinsics, depth.shape[::-1]
+        )
         for centre in truth["eyeball_centres"]:
             own = gaze.eye_pixels(depth, pose, lens, centre[None], radius)
             seen = lid_margins.opening_of_truth(depth, pose, lens, centre, radius) & own
             pixel_mm = (pose[:3, :3] @ centre + pose[:3, 3])[2] / lens[0, 0]
             pairs.append((seen, found & own, pixel_mm))
     return lid_margins.lid_margin_errors(pairs)
+
+
+def _scenes_with_lids(export: Path, surface: Surface) -> Callable[[int], RayScene]:
+    """Of a frame: the surface with its lids as poses.npz of the export has them there; at rest where it has none."""
+    rest, faces = surface.mesh.vertices, surface.mesh.faces
+    poses, scene = load_arrays(export / "poses.npz"), RayScene(rest, faces)
+    if "lids" not in poses:
+        return lambda frame: scene
+    actions = LidActions.of(facial_actions(load_head_model(), rest, faces, LID_ACTIONS))
+    if actions is None:
+        return lambda frame: scene
+    pitch = pitch_from_rest(poses["gaze"]) if "gaze" in poses else 0.0 * poses["lids"]
+    lids = dict(zip(poses["frame_index"].tolist(), zip(poses["lids"], pitch, strict=True), strict=True))
+    return lambda frame: RayScene(actions.moved(rest, *lids[frame]), faces)
 
 
 def _normal_angles(truth: np.ndarray, found: np.ndarray) -> np.ndarray:
