@@ -5,9 +5,9 @@ Reads    sample_frames: the cropped frames and their intrinsics. The subject's o
 Writes   poses.npz, mesh.npz, landmarks.npz, tracks.npz, tracking.json, overlay.png, curves.png, residuals.png.
 Method   468 landmarks a frame start the poses, dense flow and then tracks against the clip's mean texture, adjusted as
          one rigid body, hold them still; the head model is fitted to the tracks and then bent to them freely, its lids
-         laid on those of the frames. Its size
-         is the head model's mean and what the irises say, or that of a given length. Frames of another expression than
-         most are left out. Irises, followed by their texture and laid on their rims, and lids tell gaze and blinks.
+         laid on those of the frames, its lips shut. Its size is the head model's mean and what the irises say, or that
+         of a given length. Frames of another expression than most are left out. Irises, followed by their texture and
+         laid on their rims, and lids tell gaze and blinks.
 Fails    no landmarks in three frames; skin that cannot be tracked (too small, blurred, or not the same head); a head
          that does not turn (a poster, too).
 """
@@ -22,7 +22,7 @@ from shared.contract.records import LANDMARKS, MESH, TRACKED_POSES, TRACKING, TR
 
 STAGE = Stage(
     name="track_landmarks",
-    version=19,
+    version=20,
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
     given=("landmarks", "poses"),

@@ -53,18 +53,23 @@ def turned_faces(start: np.ndarray, moved: np.ndarray, faces: np.ndarray) -> np.
     return (before * after).sum(1) < _LEAST_AREA * (before * before).sum(1)
 
 
-def move_without_crossing(start: np.ndarray, wanted: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def move_without_crossing(
+    start: np.ndarray, wanted: np.ndarray, faces: np.ndarray, resting: np.ndarray | None = None
+) -> np.ndarray:
     """Vertices [V, 3] as near to wanted as goes without crossings that start did not have and without turned faces.
 
     Where moved faces cross, turn over or lose nearly all area, the move of the vertices around is halved, at last
     undone. Only edges near what has moved since the last look are followed. start [V, 3] and wanted [V, 3]: mm.
+    resting [F] bool: faces that lie on others and may cross them, None: none does.
     """
-    edges, adjacency = mesh_edges(faces)[0], vertex_adjacency(faces, len(start))
+    adjacency = vertex_adjacency(faces, len(start))
+    free = faces if resting is None else faces[~resting]
+    edges = mesh_edges(free)[0]
     share, placed = np.ones(len(start)), start
     for attempt in range(_MOST_HALVINGS + 1):
         last, placed = placed, start + share[:, None] * (wanted - start)
         near = _near(placed, edges, (placed != last).any(1))
-        some_faces, some_edges = faces[near[faces].any(1)], edges[near[edges].any(1)]
+        some_faces, some_edges = free[near[free].any(1)], edges[near[edges].any(1)]
         crossing = crossing_edges(placed, some_faces, some_edges)
         crossing = edges_beside(crossing, crossing_edges(start, some_faces, crossing))
         turned = turned_faces(start, placed, faces)

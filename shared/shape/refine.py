@@ -11,6 +11,7 @@ from shared.appearance.problem import AppearanceSettings
 from shared.compute.run_context import RunContext
 from shared.geometry.intersections import move_without_crossing
 from shared.geometry.mesh import Mesh, subdivide
+from shared.geometry.mouth import shut_lips
 from shared.geometry.surface import Surface, TrackPoints
 from shared.imaging.views import Views
 from shared.rendering.precomputed_transfer import Sizes
@@ -28,6 +29,8 @@ TRACK_REACH_MM, KNOWN_MM = 6.0, 0.2
 RIM_EDGES = 5
 """Lids' rims, so many edges around the sockets, stay where tracking has laid them: they are thinner than a pixel, and
 shading would crumple them."""
+RESTING = ("eyes", "lips", "inner_mouth")
+"""Lids lie on eyeballs and lips on each other: these may cross where they do."""
 MODEL_ERROR_MM = 2.0
 """How far a fitted head model lies from a head."""
 
@@ -63,7 +66,8 @@ def meet_outline(
     do not tell better, and a record."""
     mesh = surface.mesh
     fitted, record = fit_outline(mesh, outlined_of(surface), views, settings, context)
-    placed = move_without_crossing(mesh.vertices, fitted.vertices, fitted.faces)
+    resting = surface.faces_of(RESTING)
+    placed = move_without_crossing(mesh.vertices, fitted.vertices, fitted.faces, resting)
     return surface.with_mesh(fitted.replace(vertices=placed)), record
 
 
@@ -98,9 +102,10 @@ def refine_shape(
     solver = ShapeSolver(views, surface.tracks, reflectance, appearance, sizes, settings, context, outline)
     held = surface.faces_of(HELD) | surface.faces_near(("eye_sockets",), RIM_EDGES)
     start, refined = solver.refine(surface.mesh, surface.faces_of(SHAPED), held, begun)
-    eyes = np.repeat(surface.faces_of(("eyes",)), len(refined.faces) // len(surface.mesh.faces))
-    placed = move_without_crossing(start.vertices, refined.vertices, refined.faces[~eyes])  # lids rest on eyeballs
+    resting = np.repeat(surface.faces_of(RESTING), len(refined.faces) // len(surface.mesh.faces))
+    placed = move_without_crossing(start.vertices, refined.vertices, refined.faces, resting)
     stopped = int((np.abs(placed - refined.vertices).max(1) > 1e-6).sum())
     if stopped:
         context.note(f"shape: {stopped} vertices moved less than wanted, so that the surface does not cut itself")
-    return RefinedSurface(surface.with_mesh(refined.replace(vertices=placed)), stopped)
+    finer = surface.with_mesh(refined.replace(vertices=placed))
+    return RefinedSurface(finer.with_mesh(refined.replace(vertices=shut_lips(finer))), stopped)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shared.errors import InputError
+from shared.geometry.mouth import shut_lips
 from shared.geometry.transforms import project, rigid, rotation_range_deg
 from shared.tracking.bundle import Tracks, place_points, zoomed
 from shared.tracking.depth_noise import DepthNoise, depth_noise
@@ -304,7 +305,7 @@ def _summary(label: str, found: Adjusted) -> str:
 class _HeadFits:
     """The head fitted again and again as tracks get better. A rough fit starts from the codes of the one before; the
     last starts from the mean head, so that its shape does not hang on how often the head was fitted, and has its lids
-    where the clip shows them."""
+    where the clip shows them, and lips that meet."""
 
     def __init__(self, model: HeadModel, weights: FitWeights) -> None:
         self._model, self._weights, self._plate = model, weights, ThinPlate(model)
@@ -331,6 +332,8 @@ class _HeadFits:
         if contours is not None:
             fit = self._laid(fit, contours)
             fit = replace(fit, vertices=set_eyeballs(self._model, fit.vertices))
+        if not rough:
+            fit = replace(fit, vertices=shut_lips(self._model.surface(fit.vertices)))
         self._last = fit
         return fit, noise
 

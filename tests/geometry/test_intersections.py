@@ -52,3 +52,20 @@ def test_a_move_stops_before_it_cuts_and_goes_on_elsewhere(ball):
     assert len(crossing_edges(placed, ball.faces)) == 0
     assert not turned_faces(ball.vertices, placed, ball.faces).any()
     np.testing.assert_allclose(placed[aside], wanted[aside])
+
+
+def test_faces_that_rest_on_others_may_cross_them_but_not_turn(ball):
+    """Two balls, one pushed into the other: it goes where it is wanted, and a face of it that would fold does not."""
+    count = len(ball.vertices)
+    start = np.concatenate([ball.vertices, ball.vertices + [60.0 * ball.vertices[:, 0].max() / 20.0, 0.0, 0.0]])
+    faces = np.concatenate([ball.faces, ball.faces + count])
+    wanted = start.copy()
+    wanted[count:, 0] -= start[count:, 0].min() - 0.5 * ball.vertices[:, 0].max()
+    resting = np.arange(len(faces)) >= len(ball.faces)
+    assert len(crossing_edges(wanted, faces)) > 0
+    assert len(crossing_edges(move_without_crossing(start, wanted, faces), faces)) == 0
+    np.testing.assert_array_equal(move_without_crossing(start, wanted, faces, resting), wanted)
+    folded = wanted.copy()
+    folded[count] = wanted[count] - 2.4 * ball.vertices[0]
+    placed = move_without_crossing(start, folded, faces, resting)
+    assert turned_faces(start, folded, faces).any() and not turned_faces(start, placed, faces).any()
