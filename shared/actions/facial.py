@@ -2,9 +2,9 @@
 
 They come from the head model: carried over to the solved head (transfer), lids kept about the eyeballs (eyelids), skin
 kept from folding over (folds) and lips from passing through each other (lips). Lids that follow the gaze, which the
-model does not have, are made here. The head at rest is the solved one,
-whatever its expression is: eyes that are half shut in it need half of a blink. Eyeballs do not move; they turn as parts
-of their own.
+model does not have, are made of its eyeballs and margins (eyelids). The head at rest is the solved one, whatever its
+expression is: eyes that are half shut in it need half of a blink. Eyeballs do not move; they turn as parts of their
+own.
 """
 
 from __future__ import annotations
@@ -63,14 +63,16 @@ def facial_actions(
     for name in in_order((*known, *LOOKS)) if lids is not None else known:
         if only is not None and name not in only:
             continue
-        moved, between = np.where(still[:, None], 0.0, carried(known[name], maps)) if name in known else None, ()
+        between = ()
         if name in LOOKS:
             moved = skin.smoothed(lids.following(*LOOKS[name]))
-        elif lids is not None and name in BLINKS:
-            moved, half = lids.blink(BLINKS.index(name), known[name], moved)
-            between = ((HALF, half),)
-        elif lids is not None:
-            moved = skin.smoothed(lids.clear_of_balls(moved))
+        else:
+            moved = np.where(still[:, None], 0.0, carried(known[name], maps))
+            if lids is not None and name in BLINKS:
+                moved, half = lids.blink(BLINKS.index(name), known[name], moved)
+                between = ((HALF, half),)
+            elif lids is not None:
+                moved = skin.smoothed(lids.clear_of_balls(moved))
         if lips is not None and lips.moved_by(moved):
             moved = lips.parted(vertices + moved) - vertices
         shapes.append(BlendShape.of(name, moved, LEAST_MM, between))

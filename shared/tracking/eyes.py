@@ -93,18 +93,18 @@ def track_eyes(
     def solved(iris_px: np.ndarray) -> Gaze | None:
         return solve_gaze(iris_px, ~lids.shut, centres, distance_mm, camera_from_head, intrinsics, time_s)
 
-    def ball(gaze: Gaze) -> tuple:
-        return gaze.gaze, gaze.centres, gaze.iris_distance_mm
-
     gaze = solved(seen.iris_px)
     if gaze is not None and seen.pictures:
         for _ in range(FOLLOWED):
-            seen = replace(seen, iris_px=follow_irises(seen, *ball(gaze), camera_from_head, intrinsics))
-            gaze = solved(seen.iris_px)
+            iris_px = follow_irises(seen, gaze.gaze, gaze.centres, gaze.iris_distance_mm, camera_from_head, intrinsics)
+            seen = replace(seen, iris_px=iris_px)
+            gaze = solved(iris_px)
         if np.isfinite(gaze.iris_radius_mm):
-            irises = lay_on_rims(seen, *ball(gaze), gaze.iris_radius_mm, camera_from_head, intrinsics)
-            seen = replace(seen, iris_px=irises)
-            gaze = solved(irises)
+            iris_px = lay_on_rims(
+                seen, gaze.gaze, gaze.centres, gaze.iris_distance_mm, gaze.iris_radius_mm, camera_from_head, intrinsics
+            )
+            seen = replace(seen, iris_px=iris_px)
+            gaze = solved(iris_px)
     return TrackedEyes(replace(seen, pictures=()), lids, gaze)
 
 

@@ -55,9 +55,9 @@ def fit_rims(pictures: Sequence[MeanPicture], radius_mm: float) -> tuple[np.ndar
     for _ in range(ROUNDS):
         weights, gains = [], []
         for eye, picture in enumerate(pictures):
-            circle = _circle(found, eye, radius_mm)
-            ring = _ring(picture, *circle[:2])
-            left = _left(picture, ring * pulls[eye], *circle)
+            centre, radius, limbus = _circle(found, eye, radius_mm)
+            ring = _ring(picture, centre, radius)
+            left = _left(picture, ring * pulls[eye], centre, radius, limbus)
             near = np.abs(left[ring > 0.5]) if (ring > 0.5).any() else np.zeros(1)
             noise = max(ROBUST_SCALE * float(np.median(near)), LEAST_NOISE)
             pulls[eye] = cauchy_weight(left, OUTLIER * noise)
@@ -79,7 +79,8 @@ def _residuals(
     """What the circles of values, see _circle, leave of each picture and of what is expected of them, in deviations."""
     parts = [values / spread]
     for eye, (picture, weight, gain) in enumerate(zip(pictures, weights, gains, strict=True)):
-        parts.append(gain * np.sqrt(weight) * _left(picture, weight, *_circle(values, eye, radius_mm)))
+        centre, radius, limbus = _circle(values, eye, radius_mm)
+        parts.append(gain * np.sqrt(weight) * _left(picture, weight, centre, radius, limbus))
     return np.concatenate(parts)
 
 

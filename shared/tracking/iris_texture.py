@@ -101,9 +101,9 @@ def lay_on_rims(
     if not known:
         return laid
     rims, rim_mm = fit_rims([pictures[k] for k in known], radius_mm)
+    ahead = np.array([0.0, 0.0, distance_mm])
     for k, (across, up) in zip(known, rims, strict=True):
         side, frames, ball, _ = balls[k]
-        ahead = np.array([0.0, 0.0, distance_mm])
         beside = np.array([across, up, np.sqrt(distance_mm**2 - across**2 - up**2)])
         poses = camera_from_head[frames]
         step = ball.shown(beside, gaze[frames, side], poses) - ball.shown(ahead, gaze[frames, side], poses)

@@ -29,7 +29,7 @@ def picture(centre=(0.0, 0.0), radius=5.9, lids=3.5, spacing=0.4, noise=1.0, gli
 @pytest.mark.parametrize("case", [{}, {"glint": True}, {"lids": 2.8}, {"sides": (110.0, 230.0)}, {"spacing": 0.6}])
 def test_a_circle_beside_the_networks_and_larger_is_found(case):
     centres = np.array([[0.6, 0.4], [-0.7, 0.3]])
-    found, radius_mm = fit_rims([picture(centre, **case) for centre in centres], NETWORK_MM)
+    found, radius_mm = fit_rims([picture(centre=centre, **case) for centre in centres], NETWORK_MM)
     assert np.abs(found - centres).max() < (0.1 if case.get("lids") is None else 0.2)
     assert radius_mm == pytest.approx(5.9, rel=0.02)
 
