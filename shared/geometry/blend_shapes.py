@@ -44,15 +44,16 @@ class BlendShape:
                    tuple((weight, (share * own[used]).astype(np.float32)) for weight, own in between))
 
     def at(self, weight: float) -> np.ndarray:
-        """[n, 3] mm at a weight in [0, 1]: straight from one in-between to the next, as USD has it."""
+        """[n, 3] mm at a weight: straight from one in-between to the next; below 0 the first of these ways goes on,
+        above 1 the last one, as UsdSkel has it."""
         weights = [0.0, *(place for place, _ in self.between), 1.0]
         knots = [np.zeros_like(self.offsets), *(own for _, own in self.between), self.offsets]
-        k = min(int(np.searchsorted(weights, weight, side="right")) - 1, len(weights) - 2)
+        k = int(np.clip(np.searchsorted(weights, weight, side="right") - 1, 0, len(weights) - 2))
         share = (weight - weights[k]) / (weights[k + 1] - weights[k])
         return (1.0 - share) * knots[k] + share * knots[k + 1]
 
     def applied(self, vertices: np.ndarray, weight: float) -> np.ndarray:
-        """Vertices [V, 3] mm with the action at a weight in [0, 1]."""
+        """Vertices [V, 3] mm with the action at a weight."""
         moved = np.array(vertices, np.float64)
         moved[self.vertices] += self.at(weight)
         return moved

@@ -47,6 +47,15 @@ def test_the_way_leads_through_the_in_between():
     np.testing.assert_allclose(straight.at(0.3), 0.3 * MOVES[[1, 2, 4]], atol=1e-7)
 
 
+def test_the_way_goes_on_below_nothing_and_beyond_all():
+    """A shape without in-betweens is its own multiple everywhere."""
+    for weight, expected in ((-0.5, -HALF), (-1.0, -2.0 * HALF), (1.5, 2.0 * MOVES - HALF)):
+        np.testing.assert_allclose(SHAPE.at(weight), expected[[1, 2, 4]], atol=1e-6)
+    straight = BlendShape.of("jaw", MOVES, 0.01)
+    for weight in (-2.0, -0.3, 1.7):
+        np.testing.assert_allclose(straight.at(weight), weight * MOVES[[1, 2, 4]], atol=1e-6)
+
+
 def test_applied_moves_the_rest_nowhere():
     rest = np.arange(15.0).reshape(5, 3)
     moved = SHAPE.applied(rest, 1.0)

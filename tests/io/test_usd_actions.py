@@ -101,7 +101,7 @@ def test_the_head_at_rest_is_the_one_without_actions(opened, tmp_path):
     assert not without.GetDefaultPrim().GetPrimAtPath("geo/skeleton")
 
 
-@pytest.mark.parametrize("weight", [0.0, 0.25, 0.5, 0.8, 1.0])
+@pytest.mark.parametrize("weight", [-0.6, 0.0, 0.25, 0.5, 0.8, 1.0, 1.4])
 def test_usd_plays_what_the_shape_says(opened, weight):
     own, stage = opened
     rest = np.array(head_of(stage).GetPointsAttr().Get(), np.float64)
