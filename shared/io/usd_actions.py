@@ -14,12 +14,14 @@ Reference: UsdSkel, Schemas (Blend Shapes).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
+from pathlib import Path
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from shared.geometry.blend_shapes import BlendShape
+from shared.geometry.parts import HEAD
 from shared.io.usd_capture import UsdCapture
 
 SKELETON, ANIMATION, JOINT = "skeleton", "actions", "head"
@@ -80,3 +82,24 @@ def _define_shape(stage: Usd.Stage, path: Sdf.Path, shape: BlendShape) -> Sdf.Pa
 
 def _vectors(offsets: np.ndarray) -> Vt.Vec3fArray:
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(offsets, np.float32))
+
+
+def read_actions(path: Path | str, head: np.ndarray, only: Container[str]) -> tuple[BlendShape, ...]:
+    """The shapes of these names that a head.usda has, for the whole mesh that it was made from. head [n] int: which
+    vertices of that are geo/head, in its order. Normals are not read. Empty where there are none, or where geo/head has
+    another number of points."""
+    stage = Usd.Stage.Open(str(path))
+    mesh = UsdGeom.Mesh(stage.GetDefaultPrim().GetPrimAtPath(f"geo/{HEAD}"))
+    if not mesh or len(mesh.GetPointsAttr().Get() or ()) != len(head):
+        return ()
+    shapes = [UsdSkel.BlendShape(prim) for prim in mesh.GetPrim().GetChildren() if prim.IsA(UsdSkel.BlendShape)]
+    return tuple(_read_shape(shape, head) for shape in shapes if shape.GetPrim().GetName() in only)
+
+
+def _read_shape(prim: UsdSkel.BlendShape, head: np.ndarray) -> BlendShape:
+    vertices = head[np.array(prim.GetPointIndicesAttr().Get())]
+    order = np.argsort(vertices)
+    between = [(each.GetWeight(), np.array(each.GetOffsets(), np.float32)[order]) for each in prim.GetInbetweens()]
+    return BlendShape(prim.GetPrim().GetName(), vertices[order].astype(np.int32),
+                      np.array(prim.GetOffsetsAttr().Get(), np.float32)[order],
+                      tuple(sorted(between, key=lambda each: each[0])))

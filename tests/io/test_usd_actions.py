@@ -12,6 +12,7 @@ from shared.geometry.eyeballs import eyeballs_of
 from shared.geometry.mesh import vertex_normals
 from shared.geometry.parts import head_parts
 from shared.io.usd import HeadAsset, write_head_usda, write_single_layer
+from shared.io.usd_actions import read_actions
 from shared.io.usd_capture import UsdCapture, world_from_head_rigid
 from shared.io.usd_material import SHADER_INPUTS, TextureFile
 from shared.io.usd_validate import usd_errors
@@ -154,3 +155,20 @@ def test_the_clip_blinks_and_the_still_head_does_not(tmp_path, layers):
     np.testing.assert_allclose(shut, blink.applied(rest, 1.0), atol=1e-4)
     root.GetVariantSet("capture").SetVariantSelection("still")
     assert not any(weights.Get()) and not weights.GetTimeSamples()
+
+
+@pytest.mark.parametrize("eyes", [True, False])
+def test_shapes_are_read_as_they_were_written(tmp_path, eyes):
+    """In the whole mesh's numbers, but for what moves of eyeballs, which are meshes of their own."""
+    own = asset(eyes)
+    write_head_usda(tmp_path, own)
+    head = head_parts(own.mesh, own.eyes)[0].vertices
+    (found,) = read_actions(tmp_path / "head.usda", head, ("eyeBlinkLeft", "eyeBlinkRight"))
+    (blink,) = (shape for shape in own.actions if shape.name == "eyeBlinkLeft")
+    kept = np.isin(blink.vertices, head)
+    assert found.name == blink.name and found.between[0][0] == 0.5
+    np.testing.assert_array_equal(found.vertices, blink.vertices[kept])
+    np.testing.assert_array_equal(found.offsets, blink.offsets[kept])
+    np.testing.assert_array_equal(found.between[0][1], blink.between[0][1][kept])
+    assert read_actions(tmp_path / "head.usda", head[:-1], ("eyeBlinkLeft",)) == ()
+    assert read_actions(tmp_path / "head.usda", head, ("eyeLookUpLeft",)) == ()

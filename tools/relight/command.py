@@ -1,7 +1,7 @@
 """A solved head, or any mesh, under any light: stills and videos, and pictures of what it covers of itself.
 
     python -m tools.relight RESULT --light studio.hdr --out DIR                      the head from the front
-    python -m tools.relight RESULT --light window --frames 0,40,80 --out DIR         in the poses of the clip
+    python -m tools.relight RESULT --light window --frames 0,40,80 --out DIR         as in the clip: pose, eyes, lids
     python -m tools.relight RESULT --light sky.exr --turntable 72 --video turn.mp4 --out DIR
     python -m tools.relight statue.obj --light low_sun --roughness 0.15 --specular 12 --visibility --out DIR
 
@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from shared.errors import InputError
+from shared.geometry.eyeballs import gaze_between
 from shared.geometry.raycast import pixel_directions
 from shared.geometry.transforms import WORLD_FROM_CAMERA
 from shared.imaging.color import encode_srgb
@@ -71,7 +72,8 @@ def _turned_shot(asset: Asset, i: int, yaw: float, pitch: float, options: argpar
 
 
 def _clip_shot(asset: Asset, frame: int, options: argparse.Namespace) -> RelightShot:
-    """A frame of the clip through its own lens, whose axis is taken for the picture's middle."""
+    """A frame of the clip through its own lens, whose axis is taken for the picture's middle, with eyes and lids as
+    they are in it."""
     if asset.poses is None:
         raise InputError("a mesh has no frames", where="--frames", hint="use --view or --turntable")
     found = np.nonzero(asset.frame_index == frame)[0]
@@ -83,8 +85,11 @@ def _clip_shot(asset: Asset, frame: int, options: argparse.Namespace) -> Relight
     scale = options.size / (2.0 * asset.intrinsics[1, 2])
     width = 2 * round(asset.intrinsics[0, 2] * scale)
     lens = np.diag([scale, scale, 1.0]) @ asset.intrinsics
-    gaze = None if asset.eye_turn is None else asset.eye_turn[found[0]]
-    camera = ViewCamera(asset.poses[found[0]], lens, (width, options.size), gaze)
+    f = found[0]
+    # Eyes that shut lids may leave open a little look as they do before and after.
+    gaze = None if asset.eye_turn is None else gaze_between(asset.eye_turn)[f]
+    shut, pitch = (None if moved is None else moved[f] for moved in (asset.shut, asset.pitch))
+    camera = ViewCamera(asset.poses[f], lens, (width, options.size), gaze, lids=shut, pitch=pitch)
     return RelightShot(f"frame{frame:06d}", camera, options.light_yaw, asset.moves)
 
 
@@ -173,6 +178,7 @@ def run(options: argparse.Namespace) -> list[Path]:
         light_resolution=max(8, round((options.directions / 6) ** 0.5)),
         deep=deep,
         eyes=asset.eyes,
+        lids=asset.lids,
     )
     try:
         options.out.mkdir(parents=True, exist_ok=True)

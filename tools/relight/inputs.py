@@ -9,14 +9,16 @@ import numpy as np
 import OpenImageIO
 
 from shared.errors import InputError
-from shared.geometry.eyeballs import fit_eyeball
+from shared.geometry.blend_shapes import LID_ACTIONS, LidActions
+from shared.geometry.eyeballs import fit_eyeball, pitch_from_rest
 from shared.geometry.mesh import Mesh, midpoint_subdivision
-from shared.geometry.parts import EYES
+from shared.geometry.parts import EYES, head_parts
 from shared.geometry.transforms import WORLD_FROM_CAMERA, rotation_from_vector
 from shared.imaging.turning_eyes import TurningEyes
 from shared.io.arrays import load_arrays, read_json
 from shared.io.exr_picture import read_rec709
 from shared.io.meshes import load_mesh, read_obj, read_obj_groups
+from shared.io.usd_actions import read_actions
 from shared.rendering.near_lamp import NearLamp
 from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
 
@@ -31,7 +33,9 @@ _LARGEST_LIGHT = 8192
 class Asset:
     """What is to be lit: mesh (mm, y up, facing +z) and maps by name; of a result also its light, poses [F, 4, 4] with
     frame_index [F], intrinsics [3, 3] of the source frame, what moved in the clip, its light's lamp where that stands
-    near; of an export with a gaze, the eyes, and how they turn in each frame, eye_turn [F, 2, 2] radians."""
+    near; of an export with a gaze, the eyes, and how they turn in each frame, eye_turn [F, 2, 2] radians; of one whose
+    lids move, the actions that move them, how far its eyes are shut, shut [F, 2], and how far they look up from where
+    they do with lids at rest, pitch [F, 2] radians."""
 
     mesh: Mesh
     maps: dict[str, np.ndarray]
@@ -43,6 +47,9 @@ class Asset:
     lamp: NearLamp | None = None
     eyes: TurningEyes | None = None
     eye_turn: np.ndarray | None = None
+    lids: LidActions | None = None
+    shut: np.ndarray | None = None
+    pitch: np.ndarray | None = None
 
 
 def open_asset(path: Path, albedo: tuple[float, ...], specular: float, roughness: float) -> Asset:
@@ -88,7 +95,7 @@ def _open_result(path: Path) -> Asset:
         arrays["frame_index"],
         arrays["intrinsics"].astype(np.float64),
         *_light_of_clip(folder),
-        *_eyes_of_clip(folder, mesh, arrays),
+        **_eyes_of_clip(folder, mesh, arrays),
     )
 
 
@@ -111,15 +118,19 @@ def _light_of_clip(folder: Path) -> tuple[str, NearLamp | None]:
     raise InputError("neither run.json nor solve.json", where=str(folder), hint="name a complete result")
 
 
-def _eyes_of_clip(
-    folder: Path, mesh: Mesh, poses: dict[str, np.ndarray]
-) -> tuple[TurningEyes | None, np.ndarray | None]:
-    """The eyeballs of an export and how they turn; None where the gaze is not known."""
+def _eyes_of_clip(folder: Path, mesh: Mesh, poses: dict[str, np.ndarray]) -> dict:
+    """The fields of Asset for the eyes and lids of an export; none where the gaze is not known."""
     if "eye_turn" not in poses or not (folder / "mesh.obj").is_file():
-        return None, None
+        return {}
     groups = read_obj_groups(folder / "mesh.obj")
-    right, left = (fit_eyeball(mesh, groups[name]) for name in EYES)
-    return TurningEyes(mesh, (right, left)), poses["eye_turn"]
+    balls = tuple(fit_eyeball(mesh, groups[name]) for name in EYES)
+    found = {"eyes": TurningEyes(mesh, balls), "eye_turn": poses["eye_turn"]}
+    lids = None
+    if {"lids", "gaze"} <= poses.keys() and (folder / "head.usda").is_file():
+        lids = LidActions.of(read_actions(folder / "head.usda", head_parts(mesh, balls)[0].vertices, LID_ACTIONS))
+    if lids is not None:
+        found |= {"lids": lids, "shut": poses["lids"], "pitch": pitch_from_rest(poses["gaze"])}
+    return found
 
 
 def _read_mesh(path: Path) -> Mesh:
