@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sparse
@@ -55,6 +56,9 @@ _FACE = ("forehead", "brows", "nose", "cheek_left", "cheek_right", "upper_lip_sk
 WEIGHTS = {"eyes": 8.0, "lids": 8.0, "lips": 8.0, **dict.fromkeys(_FACE, 2.0)}
 """How much faces of some segments count against others: whoever looks at a head looks at its face, there at eyes and
 lips first; lids must fit about an eyeball that turns, and lips upon each other."""
+FEW_FACES, FEW_WEIGHTS = 10_000, {"lids": 3.0, "lips": 3.0, "eyes": 1.5}
+"""Where fewer faces than this are wanted, so much more count those of some segments: textures else shift by half a
+millimetre there."""
 _SEAM, _OUTLINE, _BORDER, _FIXED = 1, 2, 4, 8
 _MOST_FACES = 64
 """Around a vertex that may still be taken away."""
@@ -86,7 +90,7 @@ def reduced(surface: Surface, wanted: Sequence[int]) -> tuple[ReducedMesh, ...]:
     if surface.face_segment is not None:
         labels = np.where(surface.faces_of(OUTLINED), 1 + surface.face_segment.astype(np.int64), 0)
     pairs, wedges, _ = unique_pairs(np.column_stack([mesh.faces.ravel(), mesh.face_uvs.ravel()]))
-    wedges = wedges.reshape(-1, 3)
+    whole = wedges = wedges.reshape(-1, 3)
     mm_per_uv = _mm_per_uv(mesh)
     spots = np.column_stack([mesh.vertices[pairs[:, 0]], UV_WEIGHT * mm_per_uv * mesh.uvs[pairs[:, 1]]])
     spots = np.ascontiguousarray(spots, np.float64)
@@ -96,7 +100,10 @@ def reduced(surface: Surface, wanted: Sequence[int]) -> tuple[ReducedMesh, ...]:
         weight[surface.faces_of((name,))] = own
     quadrics = _quadrics(spots, wedges, lines, weight)
     faces, left, found = np.array(mesh.faces, np.int64), np.arange(len(mesh.faces)), []
-    for count in wanted:
+    for before, count in pairwise((math.inf, *wanted)):
+        if count < FEW_FACES <= before and surface.face_segment is not None:
+            for name, more in FEW_WEIGHTS.items():
+                quadrics[np.unique(whole[surface.faces_of((name,))])] *= more
         alive = np.ones(len(faces), bool)
         _collapse(faces, wedges, labels[left], alive, kinds, spots, quadrics, count)
         faces, wedges, left = faces[alive], wedges[alive], left[alive]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from shapes import grid_plane, sphere, turned
 
+from shared.geometry import reduction
 from shared.geometry.eyeballs import eyeballs_of
 from shared.geometry.mesh import Mesh, face_normals, interpolate, mesh_edges
 from shared.geometry.mesh_checks import mesh_errors, uv_overlap
@@ -139,6 +140,17 @@ def test_the_texture_stays_where_it_was(head, heads, which, largest_mm, yaw_deg)
     off_mm = texture_off_mm(heads[which].mesh, head.mesh, yaw_deg)
     assert len(off_mm) > 3000 and np.median(off_mm) < 0.35 * largest_mm
     assert np.percentile(off_mm[off_mm < 20.0], 95) < largest_mm and (off_mm > 20.0).mean() < 0.01
+
+
+def test_of_few_faces_lids_and_lips_have_a_greater_share(head, heads, monkeypatch):
+    """Of 5,000, not of 20,000; what the level before had taken away stays away."""
+    monkeypatch.setattr(reduction, "FEW_WEIGHTS", {})
+    plain = reduction.reduced(head, WANTED)
+    own = head.faces_of(("lids", "lips"))
+    counts = [[own[each.faces].sum() for each in both] for both in (heads, plain)]
+    assert counts[0][0] == counts[1][0] and counts[0][1] > 1.25 * counts[1][1]
+    np.testing.assert_array_equal(heads[0].mesh.faces, plain[0].mesh.faces)
+    assert np.isin(heads[1].faces, heads[0].faces).all()
 
 
 def topology(faces):
