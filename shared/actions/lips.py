@@ -91,8 +91,10 @@ class LipContact:
         least, placed = np.minimum(self.gap, TOUCHING_MM), moved
         best, fewest = moved, np.inf
         for attempt in range(ROUNDS + 1):
+            if np.linalg.norm(placed - moved, axis=1).max() >= MOST_MM:
+                break
             crossing = self._crossing(placed)
-            if len(crossing) < fewest and np.linalg.norm(placed - moved, axis=1).max() < MOST_MM:
+            if len(crossing) < fewest:
                 best, fewest = placed, len(crossing)
             if not len(crossing) or attempt == ROUNDS:
                 break
