@@ -69,7 +69,7 @@ PUBLISHED = ParameterGroup(
 
 STAGE = Stage(
     name="inverse_render",
-    version=39,
+    version=40,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -215,7 +215,7 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
     """
     import numpy as np
 
-    from shared.imaging.frame_index import spread_frames
+    from shared.inverse.frame_choice import shown_frames
     from shared.io.arrays import save_arrays
     from shared.io.images import write_exr
     from shared.rendering.render import LookingEyes, SurfaceMaps, render_frame
@@ -240,7 +240,7 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
         **({} if gain is None else {"gain": gain}),
     )
     maps = SurfaceMaps(result.maps["diffuse_albedo"], result.maps["specular_intensity"])
-    chosen = spread_frames(len(index), job.params.render_count)
+    chosen = shown_frames(len(index), job.params.render_count, clip.gaze)
     for f in job.progress(chosen, "re-rendering"):
         eyes = LookingEyes(result.eyes, turn[f]) if turning else None
         image, _ = render_frame(result.viewer, result.shading, maps, first + f, poses[f], clip.lens, clip.views.size,

@@ -320,6 +320,17 @@ SOLVE = (
           unit="deg", optional=True),
     Field("poses.turned_deg", "How far they turned in all, rms.", unit="deg", optional=True),
     *_LAMP,
+    Field("catchlights", "The brightest spots on the irises beside those of the solved light; absent where no open eye "
+          "is seen.", "", optional=True),
+    Field("catchlights.irises", "Irises that were looked at: of both eyes, in so many frames.", "int"),
+    Field("catchlights.with_catchlight", "Of these, how many show one.", "int"),
+    Field("catchlights.compared", "Of these, how many show one under the solved light, too.", "int"),
+    Field("catchlights.apart_deg", "Between the directions that the light comes from in the clip and by the solved "
+          "light; absent where none was compared.", "", optional=True),
+    Field("catchlights.apart_deg.median", "The median.", unit="deg"),
+    Field("catchlights.apart_deg.p95", "The 95th percentile.", unit="deg"),
+    Field("catchlights.light_over_solved", "Median ratio of their light; the clip's is too small where it burns out. "
+          "Absent where none was compared.", optional=True),
     Field("exposure", "Gains of the frames; absent where exposure and white balance stay.", "", optional=True),
     Field("exposure.brightness", "Standard deviation of their logarithm."),
     Field("exposure.tint", "The same of red against blue."),

@@ -1,4 +1,5 @@
-"""Few frames that together show as much of the face as they can: how methods work that fit single pictures."""
+"""Few frames of many: those that together show as much of the face as they can, for methods that fit single pictures,
+and those to re-render."""
 
 from __future__ import annotations
 
@@ -25,3 +26,10 @@ def covering_frames(viewer: SurfaceViewer, wanted: np.ndarray, views: Views, cou
         chosen.append(int(gain.argmax()))
         best = np.maximum(best, weight[chosen[-1]])
     return np.sort(candidates[chosen])
+
+
+def shown_frames(count: int, wanted: int, gaze: np.ndarray | None) -> np.ndarray:
+    """At most wanted indices, evenly over range(count), for re-renders whose lids are at rest: where gaze [count, 2, 2]
+    tells, NaN of a shut eye, of frames in which both eyes are open, if there are as many."""
+    awake = np.arange(count) if gaze is None else np.nonzero(np.isfinite(gaze).all((1, 2)))[0]
+    return awake[spread_frames(len(awake), wanted)] if len(awake) >= wanted else spread_frames(count, wanted)

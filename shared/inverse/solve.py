@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from shared.appearance.catchlights import check_catchlights
 from shared.appearance.chart_scale import ChartStatement, describe_scale, scale_warnings, state_chart
 from shared.appearance.diagnostics import diagnostic_warnings, diagnostics_of, face_regions
 from shared.appearance.eye_whites import describe_whites
@@ -42,6 +43,7 @@ from shared.inverse.problem import (
 )
 from shared.inverse.published_clip import solve_by_reference
 from shared.inverse.shaping import shape_and_turn
+from shared.rendering.eye_shine import EyeShine
 from shared.shape.gauss_newton import typical_edge
 from shared.shape.refine import meet_outline, surface_error
 
@@ -136,6 +138,7 @@ def solve_clip(
         if eye_texels is not None:
             turn[eye_texels.rows] = 0.0  # it was seen where the texel does not stay
         context.note(f"fine normals: {relief}")
+    catchlights = None if eyes is None else check_catchlights(views, eyes, EyeShine(viewer, shading, eyes))
     roughness, local = solution.state.roughness, solution.local_roughness_fit
     roughness = roughness if local is None else local.roughness(surface.mesh.vertices)
     record = {
@@ -147,6 +150,7 @@ def solve_clip(
                               settings.appearance.light_moves(views.moves)),
         "relief": relief,
         "diagnostics": diagnostics,
+        "catchlights": catchlights,
         "warnings": [*filter(None, [chart_warning]), *scale_warnings(chart, typical),
                      *exposure_warnings(exposure), *diagnostic_warnings(diagnostics, views.moves)],
         "albedo_scale": describe_scale(chart, typical, whites, solution.scale),
@@ -230,6 +234,7 @@ def summarise(result: InverseResult, moves: str) -> dict:
         **{key: result.record[key] for key in ("shape", "poses", "relief", "diagnostics") if key in result.record},
         **({"exposure": exposure} if (exposure := result.record.get("exposure")) else {}),
         **({"lamp": lamp} if (lamp := result.record.get("lamp")) else {}),
+        **({"catchlights": found} if (found := result.record.get("catchlights")) else {}),
         **({"model_selection": [dict(candidate) for candidate in tried]} if tried else {}),
         "iterations": list(solution.iterations),
         "albedo_scale": result.record["albedo_scale"],

@@ -37,18 +37,30 @@ class EyeShine:
 
         gaze [2, 2] radians, NaN: straight ahead; camera [3]: its centre in head space, mm.
         """
+        places, normals, mirrored, cosine = self._mirrored(gaze, camera, face, bary)
+        light = self.shading.arriving(frame, mirrored)
+        covered = np.nonzero(self.viewer.scene.occluded(places + RAY_START_MM * normals, mirrored))[0]
+        around = self.shading.blocked_light(frame)[self.shading.stand_in[self.viewer.mesh.faces[face[covered]]]]
+        light[covered] = (around * bary[covered, :, None]).sum(1)
+        return ((F0 + (1.0 - F0) * (1.0 - cosine) ** 5) * light).astype(np.float32)
+
+    def mirrored(self, gaze: np.ndarray, camera: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+        """[n, 3] unit: where the light comes from, in head space, that places on faces face [n] int with corner weights
+        bary [n, 3] send to the camera [3], mm; gaze [2, 2] radians as in reflection."""
+        return self._mirrored(gaze, camera, face, bary)[2]
+
+    def _mirrored(
+        self, gaze: np.ndarray, camera: np.ndarray, face: np.ndarray, bary: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Places, normals and mirrored directions, all [n, 3], and the cosine [n, 1] under which the camera sees
+        them."""
         mesh, side = self.viewer.mesh, self.eyes.side[face]
         places = interpolate(mesh.vertices, mesh.faces, face, bary)
         axes = gaze_direction(np.where(np.isfinite(gaze), gaze, 0.0))[side]
         normals = cornea_normals(places - np.stack([ball.centre for ball in self.eyes.balls])[side], axes)
         towards = normalised(camera - places)
         cosine = np.maximum((normals * towards).sum(1, keepdims=True), 0.0)
-        mirrored = normalised(2.0 * cosine * normals - towards)
-        light = self.shading.arriving(frame, mirrored)
-        covered = np.nonzero(self.viewer.scene.occluded(places + RAY_START_MM * normals, mirrored))[0]
-        around = self.shading.blocked_light(frame)[self.shading.stand_in[mesh.faces[face[covered]]]]
-        light[covered] = (around * bary[covered, :, None]).sum(1)
-        return ((F0 + (1.0 - F0) * (1.0 - cosine) ** 5) * light).astype(np.float32)
+        return places, normals, normalised(2.0 * cosine * normals - towards), cosine
 
 
 def cornea_normals(offsets: np.ndarray, axes: np.ndarray) -> np.ndarray:

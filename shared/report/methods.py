@@ -165,6 +165,7 @@ def _solving(records: RunRecords) -> Iterable[str]:
         yield from _transfer(parameters)
         yield from _lamp(records.solve.get("lamp") or {})
         yield from _exposure(records.solve.get("exposure") or {})
+        yield from _catchlights(records.solve.get("catchlights") or {})
     yield from _shape(parameters, records.solve.get("shape") or {})
     residuals, held_out = records.solve.get("residuals", {}), records.solve.get("held_out_frames", ())
     if isinstance(residuals.get("held_out"), float) and isinstance(residuals.get("fitted"), float):
@@ -212,6 +213,20 @@ def _exposure(exposure: Mapping[str, float]) -> Iterable[str]:
         yield (f"Exposure, which wandered by {exposure['brightness']:.0%}, and white balance, by "
                f"{exposure['tint']:.0%}, were solved as a gain of each frame and channel beside the still light "
                "{Irons1969}.")
+
+
+def _catchlights(found: Mapping[str, object]) -> Iterable[str]:
+    if not found:
+        return
+    of = f"{found['with_catchlight']} of {found['irises']} irises"
+    if "apart_deg" in found:
+        yield (f"As a check, catchlights {{Nishino2004}}: {of} show one; where the solved light gives one, too, they "
+               f"come from directions {found['apart_deg']['median']:.0f} degrees apart (median), and the clip's hold "
+               f"{found['light_over_solved']:.2f} times as much light.")
+    elif found["with_catchlight"]:
+        yield f"As a check, catchlights {{Nishino2004}}: {of} show one, where the solved light gives none."
+    else:
+        yield f"No catchlight stands out on any of {found['irises']} irises, so that none checks the light."
 
 
 def _shape(parameters: Mapping[str, object], shape: Mapping[str, object]) -> Iterable[str]:

@@ -111,6 +111,7 @@ REFERENCES = {
     "Molder2021": "Mölder et al., Sustainable data analysis with Snakemake. F1000Research 10:33, 2021.",
     "Munkberg2022": "Munkberg et al., Extracting Triangular 3D Models, Materials, and Lighting From Images. CVPR 2022.",
     "Nicolet2021": "Nicolet, Jacobson, Jakob, Large Steps in Inverse Rendering of Geometry. SIGGRAPH Asia 2021.",
+    "Nishino2004": "Nishino, Nayar, Eyes for Relighting. ACM Transactions on Graphics 23, 2004.",
     "Noh2001": "Noh, Neumann, Expression Cloning. SIGGRAPH 2001.",
     "Paszke2019": "Paszke et al., PyTorch: An Imperative Style, High-Performance Deep Learning Library. NeurIPS 2019.",
     "Ramamoorthi2001":

@@ -2,16 +2,14 @@
 
 import numpy as np
 import pytest
-from shapes import sphere
+from two_eyes import RADIUS_MM, LampShading, two_eyes
 
 from shared.geometry.eyeballs import IRIS_MM, gaze_direction
-from shared.geometry.mesh import Mesh
-from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.turning_eyes import TurningEyes
 from shared.rendering.eye_shine import CORNEA_MM, EYE_INTENSITY, EyeShine, cornea_normals
 
-CENTRES, RADIUS, CAMERA = np.array([[-30.0, 0.0, 0.0], [30.0, 0.0, 0.0]]), 12.0, np.array([0.0, 0.0, 600.0])
+APART_MM, CAMERA = 60.0, np.array([0.0, 0.0, 600.0])
 
 
 def test_a_smooth_surface_of_the_tear_film_s_index():
@@ -23,42 +21,21 @@ def test_normals_are_the_cornea_s_within_the_iris_and_the_eyeball_s_beyond():
     side = np.cross(axis, [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
     angles = np.array([0.0, 0.1, 0.3, 0.6, 1.2, 3.0])
-    offsets = RADIUS * (np.cos(angles)[:, None] * axis + np.sin(angles)[:, None] * side)
+    offsets = RADIUS_MM * (np.cos(angles)[:, None] * axis + np.sin(angles)[:, None] * side)
     normals = cornea_normals(offsets, np.broadcast_to(axis, offsets.shape))
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
     tilt = np.arctan2(normals @ side, normals @ axis)
-    distance = RADIUS * np.sin(angles)
+    distance = RADIUS_MM * np.sin(angles)
     inside = (distance < IRIS_MM - 1.0) & (angles < 1.0)
     assert inside.sum() == 3
     np.testing.assert_allclose(tilt[inside], np.arcsin(distance[inside] / CORNEA_MM), atol=1e-12)
     np.testing.assert_allclose(tilt[~inside], angles[~inside], atol=1e-12)
 
 
-class LampShading:
-    """A lamp of some twenty degrees in one direction."""
-
-    def __init__(self, lamp, vertices):
-        self.lamp, self.stand_in = lamp, np.zeros(vertices, int)
-
-    def arriving(self, frame, directions):
-        return np.repeat((directions @ self.lamp > np.cos(0.2))[:, None], 3, axis=1).astype(float)
-
-    def blocked_light(self, frame):
-        return np.full((1, 3), 0.25)
-
-
-def two_eyes():
-    ball = sphere(RADIUS, 5)
-    vertices = np.concatenate([ball.vertices + centre for centre in CENTRES])
-    faces = np.concatenate([ball.faces, ball.faces + len(ball.vertices)])
-    mesh = Mesh(vertices, faces, np.zeros((1, 2)), np.zeros_like(faces))
-    return Surface(mesh, np.zeros(len(faces), np.uint8), ("eyes",))
-
-
 @pytest.mark.parametrize("gaze", [(0.0, 0.0), (0.25, 0.1)])
 def test_the_catchlight_stands_where_the_cornea_mirrors_the_lamp(gaze):
     """On a cornea about a centre c it is near c + r h, with h halfway between the lamp and the camera."""
-    surface = two_eyes()
+    surface, centres = two_eyes(APART_MM)
     eyes, lamp = TurningEyes.of(surface), gaze_direction(np.array([0.3, 0.25]))
     shine = EyeShine(SurfaceViewer.of(surface.mesh), LampShading(lamp, len(surface.mesh.vertices)), eyes)
     face = eyes.balls[0].faces
@@ -66,8 +43,8 @@ def test_the_catchlight_stands_where_the_cornea_mirrors_the_lamp(gaze):
     bright = found > 0.03
     assert 3 <= bright.sum() < 0.02 * len(face)
     np.testing.assert_allclose(found[bright], 0.04, rtol=0.05)  # F0 where light falls in steeply
-    places = surface.mesh.vertices[surface.mesh.faces[face[bright]]].mean((0, 1)) - CENTRES[0]
-    axis, to_camera = gaze_direction(np.array(gaze)), (CAMERA - CENTRES[0]) / np.linalg.norm(CAMERA - CENTRES[0])
+    places = surface.mesh.vertices[surface.mesh.faces[face[bright]]].mean((0, 1)) - centres[0]
+    axis, to_camera = gaze_direction(np.array(gaze)), (CAMERA - centres[0]) / np.linalg.norm(CAMERA - centres[0])
     half = lamp + to_camera
     half /= np.linalg.norm(half)
     across = CORNEA_MM * (half - (half @ axis) * axis)
@@ -76,7 +53,7 @@ def test_the_catchlight_stands_where_the_cornea_mirrors_the_lamp(gaze):
 
 def test_what_the_head_covers_is_seen_as_skin():
     """Towards the other eye, no light arrives but what that one sends on."""
-    surface = two_eyes()
+    surface, _ = two_eyes(APART_MM)
     eyes = TurningEyes.of(surface)
     viewer = SurfaceViewer.of(surface.mesh)
     shine = EyeShine(viewer, LampShading(np.array([1.0, 0.0, 0.0]), len(surface.mesh.vertices)), eyes)

@@ -117,3 +117,17 @@ def test_gains_and_what_is_known_of_the_scale_are_stated():
 def test_the_lamp_stands_where_the_record_says(lamp, says):
     assert says in flat(methods_text(records(solve=SOLVE | {"lamp": lamp})))
     assert "main lamp" not in methods_text(records())
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        ({"irises": 9, "with_catchlight": 0, "compared": 0}, "No catchlight stands out on any of 9 irises"),
+        ({"irises": 9, "with_catchlight": 4, "compared": 0}, "irises show one, where the solved light gives none"),
+        ({"irises": 9, "with_catchlight": 4, "compared": 3, "apart_deg": {"median": 6.8, "p95": 9.0},
+          "light_over_solved": 0.517}, "directions 7 degrees apart (median), and the clip's hold 0.52 times as much"),
+    ],
+)
+def test_the_check_by_catchlights_is_said(found, said):
+    assert said in flat(methods_text(records(solve=SOLVE | {"catchlights": found})))
+    assert "catchlight" not in flat(methods_text(records())).lower()
