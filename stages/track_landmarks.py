@@ -7,7 +7,7 @@ Method   468 landmarks a frame start the poses, dense flow and then tracks again
          one rigid body, hold them still; the head model is fitted to the tracks and then bent to them freely, its lids
          laid on those of the frames, its lips shut. Its size is the head model's mean and what the irises say, or that
          of a given length. Frames of another expression than most are left out. Irises, followed by their texture and
-         laid on their rims, and lids tell gaze and blinks.
+         laid on their rims, and lids tell gaze and blinks; what turns with the eyes tells where open lids end.
 Fails    no landmarks in three frames; skin that cannot be tracked (too small, blurred, or not the same head); a head
          that does not turn (a poster, too).
 """
@@ -22,7 +22,7 @@ from shared.contract.records import LANDMARKS, MESH, TRACKED_POSES, TRACKING, TR
 
 STAGE = Stage(
     name="track_landmarks",
-    version=20,
+    version=21,
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
     given=("landmarks", "poses"),
@@ -209,7 +209,11 @@ def size_head(job: Job, frames, model, kept: np.ndarray, seen, track, fits: np.n
     """-> the track at the head's own size, its surface, its eyes (None without `eyes`), and what set that size. kept
     [F] int: positions of the frames with a pose, which fits [U] bool has of the tracked ones; seen: eyes of all frames;
     lens [3, 3]."""
+    from dataclasses import replace
+
     from shared.tracking.eyes import head_scale, track_eyes
+    from shared.tracking.fit_lids import LidMargins, lay_on_balls
+    from shared.tracking.fit_surface import ThinPlate
 
     def measured(track, seen):
         surface = model.surface(track.fit.vertices)
@@ -220,9 +224,14 @@ def size_head(job: Job, frames, model, kept: np.ndarray, seen, track, fits: np.n
     surface, eyes = measured(track, None if seen is None else seen.subset(kept))
     scale = head_scale(surface, eyes, job.subject.pupil_distance_mm)
     job.note(f"size: {100 * (scale.factor - 1):+.1f} % (deviation {100 * scale.log_deviation:.1f} %) by {scale.method}")
+    openings = None if eyes is None or eyes.openings is None else eyes.openings.scaled(scale.factor)
     if scale.factor != 1.0:
         track = track.scaled(scale.factor)
         surface, eyes = measured(track, None if eyes is None else eyes.seen)
+    if openings is not None:
+        vertices = lay_on_balls(ThinPlate(model), LidMargins.of(model), track.fit.vertices, openings)
+        track = replace(track, fit=replace(track.fit, vertices=vertices))
+        surface = model.surface(vertices)
     return track, surface, eyes, scale
 
 

@@ -53,7 +53,7 @@ MAY_IMPORT = {
         "tools.bench.chart tools.bench.stress tools.relight",
     "tools.setup.head_model": "shared",
     "tools.setup": "shared tools.bench.peers tools.setup.head_model",
-    "tools.documents": "shared tools.bench.chart",
+    "tools.documents": "shared tools.bench tools.bench.chart",
     "tools.goldens": "shared tools.limn tools.scoring",
 }
 """Row: rows that it may import. Rows of shared are named without the prefix, and may all import shared.errors; `shared`

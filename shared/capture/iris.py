@@ -22,7 +22,7 @@ EYE_SIZE = 64
 EYE_ENLARGEMENT = 2.3
 LEAST_WIDTH_PX = 6.0
 """Between the corners of an eye: what is seen from so far to the side, or so small, shows no iris."""
-BESIDE_LIDS_PX = 4
+BESIDE_LIDS_PX = 8
 """Kept of the picture around an eye's lids."""
 
 CONTOUR_COUNT, LID_COUNT = 71, 16

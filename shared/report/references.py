@@ -162,6 +162,8 @@ REFERENCES = {
         "Wald et al., Embree: A Kernel Framework for Efficient CPU Ray Tracing. ACM Transactions on Graphics 33, "
         "2014.",
     "Walter2007": "Walter et al., Microfacet Models for Refraction through Rough Surfaces. EGSR 2007.",
+    "Wang1994":
+        "Wang, Adelson, Representing Moving Images with Layers. IEEE Transactions on Image Processing 3, 1994.",
     "Wang2004":
         "Wang et al., Image Quality Assessment: From Error Visibility to Structural Similarity. IEEE Transactions on "
         "Image Processing 13, 2004.",

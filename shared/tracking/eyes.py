@@ -10,9 +10,11 @@ import numpy as np
 from shared.capture.iris import SeenEyes
 from shared.geometry.eyeballs import SIDES, eyeballs_of
 from shared.geometry.surface import Surface
+from shared.tracking.fit_lids import LidContours
 from shared.tracking.gaze import CENTRE_SIGMA_MM, Gaze, iris_distance, solve_gaze
 from shared.tracking.head_scale import BY_MODEL, HeadScale, scale_by_iris, scale_by_length
 from shared.tracking.iris_texture import follow_irises, lay_on_rims
+from shared.tracking.lid_openings import lid_openings
 from shared.tracking.lids import Lids, closures, lids_of
 
 FOLLOWED = 3
@@ -21,11 +23,13 @@ FOLLOWED = 3
 
 @dataclass(frozen=True)
 class TrackedEyes:
-    """gaze: None where too few frames show open eyes."""
+    """gaze: None where too few frames show open eyes; openings: what the lids leave open of the eyeballs, in head
+    space, None where pictures do not tell."""
 
     seen: SeenEyes
     lids: Lids
     gaze: Gaze | None
+    openings: LidContours | None = None
 
     @property
     def pose_arrays(self) -> dict[str, np.ndarray]:
@@ -105,7 +109,10 @@ def track_eyes(
             )
             seen = replace(seen, iris_px=iris_px)
             gaze = solved(iris_px)
-    return TrackedEyes(replace(seen, pictures=()), lids, gaze)
+    openings = None
+    if gaze is not None and seen.pictures:
+        openings = lid_openings(surface, seen, lids, gaze, camera_from_head, intrinsics)
+    return TrackedEyes(replace(seen, pictures=()), lids, gaze, openings)
 
 
 def lids_in_frames(landmarks: Mapping[str, np.ndarray], record: Mapping, frame_index: np.ndarray) -> np.ndarray | None:

@@ -4,7 +4,8 @@ Hardly a track point lies on lids, and the face mesh's landmarks slide over them
 out millimetres beside the picture's. The iris network's contours (shared.capture.iris) follow the margins, but end
 before the outer corner; the face mesh's go beyond it: of open eyes their mean is taken. It steers the codes of the head
 model as landmarks do; what the codes leave is taken up by sliding the margins over the eyeball, with the lids' skin and
-the socket's following as a thin plate. Where an eye is shut in the whole clip both margins meet on the line of
+the socket's following as a thin plate. At last lids that are open come to rest on the eyeballs where their openings
+end (shared.tracking.lid_openings). Where an eye is shut in the whole clip both margins meet on the line of
 shared.tracking.closing_line.
 """
 
@@ -19,7 +20,8 @@ from scipy.spatial import cKDTree
 
 from shared.capture.iris import FACE_MESH_LIDS, LOWER_LID, UPPER_LID
 from shared.compute.sparse_solve import factorised
-from shared.geometry.mesh import mesh_edges
+from shared.geometry.eyeballs import Eyeball, eyeballs_of
+from shared.geometry.mesh import mesh_edges, normalised
 from shared.tracking.closing_line import closing_line
 from shared.tracking.fit_eyeballs import eye_centres
 from shared.tracking.fit_head import HeadFit, Pins, landmarks_on_points, most_central
@@ -36,6 +38,10 @@ FRONT_EDGES = 3, 5
 """A lid's rim is so many edges deep, of the lower and of the upper lid: there its skin turns to the front."""
 OPEN_BEHIND_MM = 1.0
 """Rims of shut lids meet at their front edges; behind them each is so far away from the line."""
+RESTING_MM, RIM_MM, OUTSIDE_MM = 0.05, 0.8, (0.8, 0.25)
+"""Inner edges that rest on an eyeball are so far from it. The edges that one sees are so far before the ball at least,
+and so far outside of the inner ones, in the corners by the former, in the middle of the lower lid, whose rim is seen,
+and of the upper, whose rim is not."""
 LEAST_FORWARD = 0.2
 """A margin is so far before the eye's centre at least, as a share of its distance from it."""
 HOLD = 100.0
@@ -46,10 +52,12 @@ HOLD = 100.0
 class LidMargins:
     """Where the lids end in the model: [eye][lower, upper], right eye first. loops: vertices of the inner edge, where
     the socket begins, from the outer to the inner corner, both included; fronts: vertices of the edge that one sees,
-    and the share of the way from corner to corner at which each lies."""
+    and the share of the way from corner to corner at which each lies; rims: all from the one to the other, the former
+    not included, with that share, both corners' too, and how far each is on the way to the latter, 0 to 1."""
 
     loops: tuple[tuple[np.ndarray, np.ndarray], ...]
     fronts: tuple[tuple[tuple[np.ndarray, np.ndarray], ...], ...]
+    rims: tuple[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...], ...]
 
     @classmethod
     def of(cls, model: HeadModel, splits: int = 0) -> LidMargins | None:
@@ -62,14 +70,16 @@ class LidMargins:
         right = model.template[rim[:, 0], 0] < 0
         loops = tuple(_halves(rim[own], model.template) for own in (right, ~right))
         lids = model.faces[model.segment("lids")]
-        return cls(loops, tuple(_fronts(halves, lids, model.template, 2**splits) for halves in loops))
+        rims = tuple(_rims(halves, lids, model.template, 2**splits) for halves in loops)
+        return cls(loops, tuple(tuple(map(_front_edge, both)) for both in rims), rims)
 
 
-def _fronts(
+def _rims(
     halves: tuple[np.ndarray, np.ndarray], faces: np.ndarray, template: np.ndarray, times: int
-) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Of both halves: vertices so many edges, times as many, away along faces [F, 3] that are nearer to this half than
-    to the other, but not to a corner, with the share of the way at which the half's nearest vertex lies."""
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]:
+    """Of both halves: vertices up to so many edges, times as many, away along faces [F, 3] that are nearer to this half
+    than to the other, the share of the way at which the half's nearest vertex lies, and how many of the edges they are
+    away, as a share."""
     rings = [np.unique(np.concatenate(halves))]
     reached = rings[0]
     for _ in range(times * max(FRONT_EDGES)):
@@ -77,10 +87,20 @@ def _fronts(
         reached = np.union1d(reached, rings[-1])
     trees, found = [cKDTree(template[half, :2]) for half in halves], []
     for own, other, half, edges in zip(trees, trees[::-1], halves, FRONT_EDGES, strict=True):
-        (apart, at), (elsewhere, _) = (tree.query(template[rings[times * edges], :2]) for tree in (own, other))
-        chosen = (apart < elsewhere) & (at > 0) & (at < len(half) - 1)
-        found.append((rings[times * edges][chosen], at[chosen] / (len(half) - 1)))
+        parts = []
+        for k in range(1, times * edges + 1):
+            (apart, at), (elsewhere, _) = (tree.query(template[rings[k], :2]) for tree in (own, other))
+            chosen = apart < elsewhere
+            parts.append((rings[k][chosen], at[chosen] / (len(half) - 1), np.full(chosen.sum(), k / (times * edges))))
+        found.append(tuple(np.concatenate(column) for column in zip(*parts, strict=True)))
     return tuple(found)
+
+
+def _front_edge(rim: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Of a rim's vertices, shares and places between its edges those of the front edge, but for the corners'."""
+    vertices, share, forward = rim
+    chosen = (forward == 1.0) & (share > 0.0) & (share < 1.0)
+    return vertices[chosen], share[chosen]
 
 
 def _halves(rim: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,6 +127,10 @@ class LidContours:
 
     points: np.ndarray
     shut: np.ndarray
+
+    def scaled(self, factor: float) -> LidContours:
+        """Of a head that is larger by a factor."""
+        return replace(self, points=factor * self.points)
 
     def moved(self, fit: HeadFit) -> LidContours:
         """From track space to head space."""
@@ -171,6 +195,43 @@ def lay_lids(plate: ThinPlate, margins: LidMargins, vertices: np.ndarray, contou
     return vertices + followed(plate, held, np.concatenate(targets)[first] - vertices[held])
 
 
+def lay_on_balls(plate: ThinPlate, margins: LidMargins, vertices: np.ndarray, openings: LidContours) -> np.ndarray:
+    """Vertices [V, 3] whose lids leave open of the eyeballs what the openings (head space) do: inner edges rest on the
+    eyeballs there, and the edges that one sees lie a little outside; nothing but lids and sockets moves."""
+    held, targets = [], []
+    for eye, (ball, shown) in enumerate(zip(eyeballs_of(plate.model.surface(vertices)), openings.points, strict=True)):
+        if np.isfinite(shown).all():
+            own, places = _resting(margins, eye, vertices, shown, ball)
+            held.append(own)
+            targets.append(places)
+    if not held:
+        return vertices
+    held, first = np.unique(np.concatenate(held), return_index=True)
+    return vertices + followed(plate, held, np.concatenate(targets)[first] - vertices[held])
+
+
+def _resting(
+    margins: LidMargins, eye: int, vertices: np.ndarray, shown: np.ndarray, ball: Eyeball
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [n] and their places [n, 3]: inner edges on the ball along the curves shown [2, n, 3], front edges
+    outside of them and before the ball."""
+    held, places = [], []
+    across = normalised((shown[0, -1] - shown[0, 0])[None, :2])[0]
+    up = np.array([-across[1], across[0]]) * np.sign(across[0])
+    for sign, outside, loop, (rim, share, forward), curve in zip(
+        (-1.0, 1.0), OUTSIDE_MM, margins.loops[eye], margins.rims[eye], shown, strict=True
+    ):
+        way, radius = _way(vertices[loop]), ball.radius + RESTING_MM
+        held += [loop, rim]
+        places.append(_on_curve(way, curve, ball.centre, np.full(len(loop), radius)))
+        turn = np.pi * share[:, None]
+        away = np.sin(turn) * sign * up - np.cos(turn) * across
+        off = (RIM_MM + (outside - RIM_MM) * np.sin(turn)) * away * forward[:, None]
+        length = np.maximum(np.linalg.norm(vertices[rim] - ball.centre, axis=1), radius + RIM_MM * forward)
+        places.append(_on_curve(share, curve, ball.centre, length, off))
+    return np.concatenate(held), np.concatenate(places)
+
+
 def _open(
     loops: tuple[np.ndarray, np.ndarray], vertices: np.ndarray, shown: np.ndarray, centre: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -195,7 +256,7 @@ def _shut(
         held += [front, loop]
         places.append(_on_curve(share, line, centre, np.interp(share, shares, depth)))
         way = _way(vertices[loop])
-        away = sign * OPEN_BEHIND_MM * np.sqrt(np.sin(np.pi * way))
+        away = np.column_stack([np.zeros(len(way)), sign * OPEN_BEHIND_MM * np.sqrt(np.sin(np.pi * way))])
         places.append(_on_curve(way, line, centre, np.linalg.norm(vertices[loop] - centre, axis=1), away))
     return np.concatenate(held), np.concatenate(places)
 
@@ -207,12 +268,11 @@ def _profile(shares: np.ndarray, share: np.ndarray, radius: np.ndarray) -> np.nd
 
 
 def _on_curve(
-    way: np.ndarray, curve: np.ndarray, centre: np.ndarray, radius: np.ndarray, above: np.ndarray | float = 0.0
+    way: np.ndarray, curve: np.ndarray, centre: np.ndarray, radius: np.ndarray, off: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """Places [n, 3] at shares way [n] of a curve [9, 3], so far above it, mm, as seen from the front, and as far as
+    """Places [n, 3] at shares way [n] of a curve [m, 3], off it by [n, 2] mm, as seen from the front, and as far as
     radius [n] from the eye's centre [3]."""
-    target = PchipInterpolator(_way(curve), curve[:, :2])(way)
-    target[:, 1] += above
+    target = PchipInterpolator(_way(curve), curve[:, :2])(way) + off
     across = np.square(target - centre[:2]).sum(1)
     forward = np.sqrt(np.maximum(radius**2 - across, np.square(LEAST_FORWARD * radius)))
     return np.column_stack([target, centre[2] + forward])

@@ -10,7 +10,7 @@ from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import camera_centres, rigid
 from tools.scoring.lid_margins import (
     LEAST_PIXELS,
-    border_distances,
+    border_offsets,
     lid_margin_errors,
     opening_of_result,
     opening_of_truth,
@@ -49,13 +49,30 @@ def true_depth() -> np.ndarray:
 
 
 def test_like_openings_are_not_apart():
-    assert border_distances(disc(30.0), disc(30.0)).max() == 0.0
+    assert border_offsets(disc(30.0), disc(30.0)).max() == 0.0
 
 
-def test_a_wider_opening_is_off_by_how_much_wider_it_is():
-    assert border_distances(disc(30.0), disc(33.0)).mean() == pytest.approx(3.0, abs=0.15)
-    shifted = border_distances(disc(30.0), disc(30.0, (60.0, 64.0)))
-    assert shifted.mean() == pytest.approx(4.0 * 2.0 / np.pi, abs=0.2)  # |cos| over a circle
+@pytest.mark.parametrize("wider", [3.0, 0.3, -0.3, -2.0])
+def test_an_opening_is_off_by_how_much_wider_or_narrower_it_is(wider):
+    """To a tenth of a pixel in the mean, and to what the few pixels of a sector tell."""
+    offsets = border_offsets(disc(30.0), disc(30.0 + wider))
+    assert offsets.mean() == pytest.approx(abs(wider) * (1.0 + wider / 60.0), abs=0.1)
+    np.testing.assert_allclose(offsets, abs(wider), atol=0.35)
+
+
+def test_a_shifted_opening_is_off_along_its_way():
+    offsets = border_offsets(disc(30.0), disc(30.0, (60.0, 64.0)))
+    assert offsets.mean() == pytest.approx(4.0 * 2.0 / np.pi, abs=0.1)  # |cos| over a circle
+    assert offsets.min() < 0.6 and offsets.max() == pytest.approx(4.0, abs=0.5)
+
+
+def test_sectors_of_a_narrow_opening_are_told_apart():
+    """An ellipse whose upper half is moved up by two pixels: sectors of the lower half are not off."""
+    row, column = np.indices((120, 120)) + 0.5
+    truth = np.hypot((column - 60.0) / 40.0, (row - 60.0) / 12.0) < 1.0
+    found = truth | (np.hypot((column - 60.0) / 40.0, (row - 58.0) / 12.0) < 1.0) & (row < 60.0)
+    offsets = np.sort(border_offsets(truth, found))
+    assert offsets[7] < 0.1 and np.median(offsets[8:]) == pytest.approx(2.0, abs=0.3)
 
 
 def test_openings_of_truth_and_result_are_where_the_eyeballs_are_seen():

@@ -1,8 +1,11 @@
 """What is recorded of the eyes of a fitted head."""
 
+from dataclasses import replace
+
+import drawn_eyes
 import numpy as np
 from field_check import below, field_faults
-from shapes import nods
+from shapes import nods, two_balls
 
 from shared.capture.iris import EyePicture, EyePoints, SeenEyes
 from shared.contract.records import LANDMARKS, TRACKED_POSES, TRACKING
@@ -89,3 +92,15 @@ def test_lids_in_frames_are_those_of_the_frames_asked_for():
     shut = {"eyes": {"shut_right": [2, 4, 6, 9], "shut_left": [4, 9]}}
     assert lids_in_frames(landmarks, shut, frames)[:, 0].tolist() == [0.0] * 4
     assert lids_in_frames({"frame_index": frames}, blinks, frames) is None
+
+
+def test_irises_are_followed_and_the_lids_openings_found_in_the_pictures():
+    gaze, poses, lens = drawn_eyes.gaze_on_the_camera(), drawn_eyes.poses(), drawn_eyes.LENS
+    seen, true = drawn_eyes.drawn(gaze, np.ones(len(gaze)), glint=False), drawn_eyes.iris_centres(gaze)
+    surface, time_s = two_balls(drawn_eyes.CENTRES, drawn_eyes.RADIUS_MM), np.arange(len(gaze)) / 10
+    found = track_eyes(surface, seen, poses, lens, time_s)
+    before, after = (np.linalg.norm(px[:, :, 0] - true, axis=-1) for px in (seen.iris_px, found.seen.iris_px))
+    assert np.median(after) < 0.5 * np.median(before)
+    assert found.seen.pictures == () and np.isfinite(found.openings.points).all()
+    plain = track_eyes(surface, replace(seen, pictures=()), poses, lens, time_s)
+    assert plain.openings is None and np.array_equal(plain.seen.iris_px, seen.iris_px)

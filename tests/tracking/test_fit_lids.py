@@ -7,11 +7,12 @@ import pytest
 from shapes import nods
 
 from shared.capture.iris import FACE_MESH_LIDS, LOWER_LID, UPPER_LID
+from shared.geometry.eyeballs import eyeballs_of
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import project
 from shared.tracking.fit_eyeballs import eye_centres, set_eyeballs
 from shared.tracking.fit_head import FitWeights, HeadFit, fit_codes
-from shared.tracking.fit_lids import LidContours, LidMargins, lay_lids, lid_contours, lid_pins
+from shared.tracking.fit_lids import LidContours, LidMargins, lay_lids, lay_on_balls, lid_contours, lid_pins
 from shared.tracking.fit_surface import ThinPlate
 from shared.tracking.lids import Lids
 from shared.tracking.tracked_clip import TrackedClip
@@ -142,3 +143,34 @@ def test_contours_lie_where_the_frames_show_them(head, shut):
     assert np.abs(found.points[..., :2] - contours.points[..., :2]).max() < 0.4
     moved = found.moved(HeadFit(2.0, np.eye(3), np.array([0.0, 1.0, 0.0]), None, None, None))
     assert np.allclose(moved.points, 2.0 * found.points + [0.0, 1.0, 0.0])
+
+
+def test_lids_that_rest_on_the_balls_leave_open_what_they_are_told_to(head):
+    """Ellipses, as seen from the front and, since inner edges lie on the balls, from twenty degrees below, too."""
+    model, margins = head
+    vertices = set_eyeballs(model, model.template)
+    balls = eyeballs_of(model.surface(vertices))
+    angle, half = np.linspace(0.0, np.pi, 17), np.array([9.0, 3.5, 4.5])
+    points = np.empty((2, 2, 17, 3))
+    for eye, (ball, outward) in enumerate(zip(balls, (-1.0, 1.0), strict=True)):
+        for lid, height in enumerate((-half[1], half[2])):
+            across = np.stack([outward * half[0] * np.cos(angle), height * np.sin(angle)], axis=1)
+            front = np.sqrt(ball.radius**2 - (across**2).sum(1))
+            points[eye, lid] = ball.centre + np.column_stack([across, front])
+    laid = lay_on_balls(ThinPlate(model), margins, vertices, LidContours(points, np.zeros(2, bool)))
+    other = np.unique(model.faces[~model.segment("lids", "eye_sockets")])
+    assert np.array_equal(laid[other], vertices[other])
+    scene, eyes = RayScene(laid, model.faces), np.nonzero(model.segment("eyes"))[0]
+    step = 0.2
+    for ball in balls:
+        x, y = np.meshgrid(np.arange(-12.0, 12.0, step), np.arange(-8.0, 8.0, step))
+        place = np.stack([x.ravel(), y.ravel(), np.sqrt(np.maximum(ball.radius**2 - x**2 - y**2, 0.0)).ravel()], 1)
+        wanted = (x / half[0]) ** 2 + (y / np.where(y < 0, half[1], half[2])) ** 2 < 1.0
+        for pitch in np.radians([0.0, -20.0]):
+            towards = np.array([0.0, np.sin(pitch), np.cos(pitch)])
+            start = ball.centre + place + 100.0 * towards
+            open_there = np.isin(scene.first_faces(start, np.tile(-towards, (len(start), 1))), eyes).reshape(x.shape)
+            border_mm = 2.0 * np.pi * np.sqrt(0.5 * (half[0] ** 2 + half[1:].mean() ** 2))
+            assert step**2 * (wanted ^ open_there).sum() < 0.25 * border_mm
+    unseen = LidContours(np.full_like(points, np.nan), np.zeros(2, bool))
+    assert lay_on_balls(ThinPlate(model), margins, vertices, unseen) is vertices

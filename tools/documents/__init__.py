@@ -1,5 +1,5 @@
-"""Keeps the README's tables and picture in step with the code and its results.
+"""Keeps the README's tables and the documents' pictures in step with the code and its results.
 
-Read in this order: readme, picture.
-May import: shared, tools.bench.chart.
+Read in this order: readme, picture, eyes.
+May import: shared, tools.bench, tools.bench.chart.
 """
