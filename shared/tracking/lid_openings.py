@@ -50,6 +50,8 @@ LASHES_MM = 0.7
 """The network draws the upper contour along the lashes, so far above the lid's edge."""
 PER_MM = 0.5
 """Evidence that outweighs a millimetre from the network's contour."""
+BEYOND_MM = 1.5
+"""So far beyond the network's contour nothing is open: what moves there are mirror images in glasses, or hair."""
 SMOOTH_MM = 0.4
 SEEN_SHARE, WELL_SEEN_SHARE = 0.15, 0.5
 """Of the frames: places that fewer show with both explanations are judged by the skin's alone."""
@@ -185,7 +187,9 @@ def _evidence(
     alone = np.where(np.isfinite(stays).mean(0) > SEEN_SHARE, usual + STILL - _mean(stays), 0.0)
     blend = np.where(known, np.minimum(share / WELL_SEEN_SHARE, 1.0), 0.0)
     said = np.clip(blend * compared + (1.0 - blend) * alone, -LARGEST, LARGEST).reshape(shape)
-    return ndimage.gaussian_filter(said, SMOOTH_MM / STEP_MM) + PER_MM * _signed_distance(inside)
+    apart = _signed_distance(inside)
+    evidence = ndimage.gaussian_filter(said, SMOOTH_MM / STEP_MM) + PER_MM * apart
+    return np.where(apart > BEYOND_MM, np.maximum(evidence, PER_MM), evidence)
 
 
 def _off_still(views: list[EyeView], ball: ViewedBall, places: np.ndarray, inside: np.ndarray) -> np.ndarray:

@@ -8,11 +8,11 @@ import pytest
 from drawn_eyes import CENTRES, FRAMES, LENS, LIDS_MM, RADIUS_MM, drawn, gaze_on_the_camera, iris_centres, poses
 from shapes import two_balls
 
-from shared.capture.iris import UPPER_LID
+from shared.capture.iris import UPPER_LID, EyePicture
 from shared.geometry.transforms import project
 from shared.tracking import lid_openings as lid_openings_module
 from shared.tracking.gaze import Gaze
-from shared.tracking.lid_openings import LEAST_FRAMES, lid_openings
+from shared.tracking.lid_openings import BEYOND_MM, LEAST_FRAMES, lid_openings
 from shared.tracking.lids import Lids
 
 
@@ -29,10 +29,10 @@ def eyes_that_look(at):
     return drawn(GAZES[at], np.ones(FRAMES), glint=False)
 
 
-def found(at, network_mm, frames=FRAMES):
+def found(at, network_mm, frames=FRAMES, seen=None):
     """The openings of eyes that look at something, where the network has contours network_mm [16, 3] and this many
     frames have open eyes."""
-    gaze, seen = GAZES[at], eyes_that_look(at)
+    gaze, seen = GAZES[at], seen or eyes_that_look(at)
     lids_px = np.stack([[project(centre + network_mm * (side, 1, 1), pose, LENS)[0] for side, centre in
                          zip((-1, 1), CENTRES, strict=True)] for pose in poses()])  # fmt: skip
     seen = replace(seen, iris_px=seen.iris_px + (iris_centres(gaze) - seen.iris_px[:, :, 0])[:, :, None],
@@ -76,6 +76,18 @@ def test_where_nothing_moves_the_network_s_contour_stays():
     lower, upper, _ = heights(openings, 0)
     assert lower == pytest.approx(-4.0, abs=0.45)
     assert upper == pytest.approx(5.0, abs=0.45)
+
+
+def test_what_flickers_far_beyond_the_network_s_contour_is_not_open():
+    """As the mirror image of a window in glasses does: here all that lies under the lower lid."""
+    seen, pictures = eyes_that_look("camera"), []
+    for f, (both, lids_px) in enumerate(zip(seen.pictures, seen.lids_px, strict=True)):
+        grey = [picture.grey.copy() for picture in both]
+        for own, picture, lids in zip(grey, both, lids_px, strict=True):
+            own[round(lids[4, 1] - picture.corner[1]) :] = (60, 240)[f % 2]
+        pictures.append(tuple(EyePicture(own, picture.corner) for own, picture in zip(grey, both, strict=True)))
+    lower, _, _ = heights(found("camera", LIDS_MM, seen=replace(seen, pictures=tuple(pictures))), 0)
+    assert -4.0 - BEYOND_MM - 0.3 < lower < -4.0 - 0.5 * BEYOND_MM
 
 
 def test_too_few_open_eyes_tell_nothing():
