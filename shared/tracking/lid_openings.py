@@ -189,7 +189,7 @@ def _evidence(
     said = np.clip(blend * compared + (1.0 - blend) * alone, -LARGEST, LARGEST).reshape(shape)
     apart = _signed_distance(inside)
     evidence = ndimage.gaussian_filter(said, SMOOTH_MM / STEP_MM) + PER_MM * apart
-    return np.where(apart > BEYOND_MM, np.maximum(evidence, PER_MM), evidence)
+    return np.where(apart > BEYOND_MM, np.maximum(evidence, LARGEST), evidence)
 
 
 def _off_still(views: list[EyeView], ball: ViewedBall, places: np.ndarray, inside: np.ndarray) -> np.ndarray:
@@ -209,19 +209,14 @@ def _off_still(views: list[EyeView], ball: ViewedBall, places: np.ndarray, insid
 def _margins(evidence: np.ndarray, raster: _Raster) -> np.ndarray | None:
     """[2, POINTS, 2] mm along the raster: lower and upper border of what is below 0 about the network's contour, from
     the outer to the inner corner; None where nothing is."""
-    labels, _ = ndimage.label(evidence < 0.0)
-    own = labels[raster.inside() & (labels > 0)]
-    if not len(own):
-        return None
-    opening = ndimage.binary_fill_holes(labels == np.bincount(own).argmax())
-    opening = ndimage.binary_opening(opening, ndimage.iterate_structure(ndimage.generate_binary_structure(2, 1), 3))
-    columns = np.nonzero(opening.any(0))[0]
+    diamond = ndimage.iterate_structure(ndimage.generate_binary_structure(2, 1), 3)
+    open_here = ndimage.binary_fill_holes(_largest_part(evidence < 0.0, raster.inside()))
+    open_here = _largest_part(ndimage.binary_opening(open_here, diamond), raster.inside())
+    columns = np.nonzero(open_here.any(0))[0]
     if len(columns) < POINTS:
         return None
-    columns = np.arange(columns[0], columns[-1] + 1)
-    filled = opening[:, columns]
-    first = np.where(filled.any(0), filled.argmax(0), 0)
-    last = np.where(filled.any(0), len(raster.rows) - 1 - filled[::-1].argmax(0), 0)
+    first = open_here[:, columns].argmax(0)
+    last = len(raster.rows) - 1 - open_here[::-1, columns].argmax(0)
     lower, upper = (_crossing(evidence[:, columns], row, step, raster.rows) for row, step in ((first, -1), (last, 1)))
     way = raster.columns[columns]
     lower, upper = (ndimage.gaussian_filter1d(curve, SMOOTH_MM / STEP_MM, mode="nearest") for curve in (lower, upper))
@@ -233,6 +228,14 @@ def _margins(evidence: np.ndarray, raster: _Raster) -> np.ndarray | None:
         heights[[0, -1]] = ends
         curves.append(np.column_stack([places, heights]))
     return np.stack(curves)
+
+
+def _largest_part(mask: np.ndarray, within: np.ndarray) -> np.ndarray:
+    """[h, w] bool: the connected part of a mask [h, w] bool that fills most of `within` [h, w] bool; empty where none
+    does."""
+    labels, _ = ndimage.label(mask)
+    own = labels[within & mask]
+    return labels == np.bincount(own).argmax() if len(own) else np.zeros_like(mask)
 
 
 def _crossing(evidence: np.ndarray, row: np.ndarray, step: int, rows: np.ndarray) -> np.ndarray:
