@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from shared.capture.iris import LOWER_LID, UPPER_LID, EyePicture, EyePoints, crop_of_eye
+from shared.capture.iris import BESIDE_LIDS_PX, LOWER_LID, UPPER_LID, EyePicture, EyePoints, crop_of_eye
 from shared.tracking.models import own_iris_network
 
 HEIGHT, WIDTH, ENLARGED = 120, 160, 8
@@ -91,7 +91,8 @@ def test_both_eyes_come_from_the_face_and_a_hidden_one_is_none(network):
 def test_the_picture_of_an_eye_lies_about_its_lids_and_within_the_frame():
     rgb, lids = drawn_eye(), np.array([[2.2, 40.0], [30.0, 52.6]])
     picture = EyePicture.of(rgb, lids)
-    assert picture.corner.tolist() == [0, 36] and picture.grey.shape == (57 - 36, 34)
-    assert np.array_equal(picture.grey, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)[36:57, :34])
+    first, last = 40 - BESIDE_LIDS_PX, 53 + BESIDE_LIDS_PX
+    assert picture.corner.tolist() == [0, first] and picture.grey.shape == (last - first, 30 + BESIDE_LIDS_PX)
+    assert np.array_equal(picture.grey, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)[first:last, : 30 + BESIDE_LIDS_PX])
     outside = EyePicture.of(rgb, lids + (WIDTH, 0))
     assert outside.grey.shape[1] >= 1 and outside.corner[0] <= WIDTH - 1
