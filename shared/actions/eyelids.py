@@ -91,8 +91,7 @@ class Eyelids:
                 turn = gain * up * np.sqrt(np.sin(np.pi * share))
                 held.append(own)
                 moves.append(_cartesian(azimuth, height + turn, length) - arms[own])
-        held, first = np.unique(np.concatenate(held), return_index=True)
-        moved = followed(self.plate, held, np.concatenate(moves)[first])
+        moved = followed(self.plate, held, moves)
         return _clear(arms + moved, arms, ball) - arms
 
     def _met(self, arms: np.ndarray, eye: int) -> np.ndarray:
@@ -109,8 +108,7 @@ class Eyelids:
             # The rim behind a margin goes with it, but for the corners.
             held += [own, loop]
             moves += [met, rim * np.sqrt(np.sin(np.pi * way))[:, None]]
-        held, first = np.unique(np.concatenate(held), return_index=True)
-        return arms + followed(self.plate, held, np.concatenate(moves)[first])
+        return arms + followed(self.plate, held, moves)
 
     def clear_of_balls(self, moves: np.ndarray) -> np.ndarray:
         """Displacements moves [V, 3] mm with lids pushed out of the eyeballs to where they may be."""

@@ -11,6 +11,7 @@ shared.tracking.closing_line.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -191,8 +192,7 @@ def lay_lids(plate: ThinPlate, margins: LidMargins, vertices: np.ndarray, contou
             targets.append(places)
     if not held:
         return vertices
-    held, first = np.unique(np.concatenate(held), return_index=True)
-    return vertices + followed(plate, held, np.concatenate(targets)[first] - vertices[held])
+    return vertices + followed(plate, held, [places - vertices[own] for own, places in zip(held, targets, strict=True)])
 
 
 def lay_on_balls(plate: ThinPlate, margins: LidMargins, vertices: np.ndarray, openings: LidContours) -> np.ndarray:
@@ -206,8 +206,7 @@ def lay_on_balls(plate: ThinPlate, margins: LidMargins, vertices: np.ndarray, op
             targets.append(places)
     if not held:
         return vertices
-    held, first = np.unique(np.concatenate(held), return_index=True)
-    return vertices + followed(plate, held, np.concatenate(targets)[first] - vertices[held])
+    return vertices + followed(plate, held, [places - vertices[own] for own, places in zip(held, targets, strict=True)])
 
 
 def _resting(
@@ -284,9 +283,11 @@ def _way(line: np.ndarray) -> np.ndarray:
     return way / way[-1]
 
 
-def followed(plate: ThinPlate, held: np.ndarray, moves: np.ndarray) -> np.ndarray:
-    """Displacements [V, 3]: of held [n] vertices near moves [n, 3], of lids and sockets as a plate, none elsewhere."""
-    model = plate.model
+def followed(plate: ThinPlate, held: Sequence[np.ndarray], moves: Sequence[np.ndarray]) -> np.ndarray:
+    """Displacements [V, 3]: of held vertices, in parts [n] each, near their moves [n, 3], of lids and sockets as a
+    plate, none elsewhere. A vertex of several parts moves as the first of them says."""
+    held, first = np.unique(np.concatenate(held), return_index=True)
+    moves, model = np.concatenate(moves)[first], plate.model
     soft = model.segment("lids", "eye_sockets")
     free = np.setdiff1d(np.unique(model.faces[soft]), np.unique(model.faces[~soft]))
     place = np.full(len(model.template), -1)
