@@ -7,29 +7,35 @@ the picture can be compared with a camera's.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from shared.compute.compiled import compiled
 from shared.compute.threads import share_out
-from shared.geometry.raycast import camera_hits
+from shared.geometry.mesh import Mesh, interpolate, normalised
+from shared.geometry.raycast import RAY_START_MM, RayScene, camera_hits, pixel_directions
 from shared.geometry.transforms import camera_centres
 from shared.imaging.image_sampling import SurfaceViewer
+from shared.imaging.texture import sample_bilinear
 from shared.imaging.turning_eyes import TurningEyes
 from shared.rendering.eye_shine import EyeShine
 from shared.rendering.shading import VertexShading
 
 _ROWS_PER_BAND = 32
+LAYERS, LEAST_LEFT = 4, 0.02
+"""Surfaces behind each other that a ray looks through, and the share of it below which what is left does not count."""
 
 
 @dataclass(frozen=True)
 class SurfaceMaps:
-    """UV-space maps: albedo [S, S, 3] and specular_intensity [S, S]."""
+    """UV-space maps: albedo [S, T, 3], specular_intensity [S, T], and alpha [S, T]: how much of a place is there, None:
+    all of it."""
 
     albedo: np.ndarray
     specular_intensity: np.ndarray
+    alpha: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,29 +114,73 @@ def render_lights(
         for row in range(samples):
             for column in range(samples):
                 offsets = (column + 0.5) / samples, (row + 0.5) / samples
-                face, bary, _ = camera_hits(viewer.scene, camera_from_head, lens, width, rows, offsets)
-                face, bary = face.ravel(), bary.reshape(-1, 3)
-                hits[pixels] += face >= 0
-                read = (face, bary) if eyes is None else eyes.eyes.read_at(face, bary, eyes.gaze)
-                for frame, shade, sent in zip(frames, shades, radiance[:, pixels], strict=True):
-                    shine = no_shine if eyes is None else eyes.shine(viewer, shading, frame, camera, face, bary)
-                    _add_radiance(
-                        face, bary, *read, shine, mesh.faces, mesh.face_uvs, uvs, albedo, intensity, shade, sent
-                    )
+                for face, bary, share in seen_layers(
+                    viewer, maps.alpha, camera_from_head, lens, (width, rows), offsets
+                ):
+                    hits[pixels] += share
+                    read = (face, bary) if eyes is None else eyes.eyes.read_at(face, bary, eyes.gaze)
+                    for frame, shade, sent in zip(frames, shades, radiance[:, pixels], strict=True):
+                        shine = no_shine if eyes is None else eyes.shine(viewer, shading, frame, camera, face, bary)
+                        _add_radiance(
+                            face, bary, share, *read, shine, mesh.faces, mesh.face_uvs, uvs, albedo, intensity, shade,
+                            sent,
+                        )
 
     share_out(-(-height // _ROWS_PER_BAND), render)
-    radiance /= np.maximum(hits, 1.0)[:, None]
+    radiance /= np.where(hits > 0.0, hits, 1.0)[:, None]
     return list(radiance.reshape(-1, height, width, 3)), (hits / samples**2).reshape(height, width)
+
+
+def seen_layers(
+    viewer: SurfaceViewer, alpha: np.ndarray | None, camera_from_head: np.ndarray, intrinsics: np.ndarray,
+    size: tuple[int, int], offsets: tuple[float, float],
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """What a ray through each of N pixels meets, layer by layer: face [N] int (-1: nothing), bary [N, 3], and the share
+    of the ray that ends there [N] float32. size: (width, height); offsets within the pixels.
+
+    alpha [S, T]: what lets through what it is short of 1, for the next layer; None: nothing does.
+    """
+    face, bary, _ = camera_hits(viewer.scene, camera_from_head, intrinsics, *size, offsets)
+    face, bary = face.ravel(), bary.reshape(-1, 3)
+    if alpha is None:
+        yield face, bary, (face >= 0).astype(np.float32)
+        return
+    mesh, left = viewer.mesh, np.ones(len(face), np.float32)
+    directions = pixel_directions(intrinsics, *size, offsets).reshape(-1, 3) @ camera_from_head[:3, :3]
+    for _ in range(LAYERS):
+        own, hit = np.zeros_like(left), np.nonzero(face >= 0)[0]
+        place = interpolate(mesh.uvs, mesh.face_uvs, face[hit], bary[hit])
+        own[hit] = sample_bilinear(alpha, place)
+        yield face, bary, left * own
+        left = left * (1.0 - own)
+        on = hit[left[hit] > LEAST_LEFT]
+        if not len(on):
+            return
+        start = interpolate(mesh.vertices, mesh.faces, face[on], bary[on])
+        away = normalised(directions[on])
+        face, bary = np.full_like(face, -1), np.zeros_like(bary)
+        face[on], bary[on], _ = viewer.scene.intersect(start + RAY_START_MM * away, away)
+
+
+def solid_viewer(mesh: Mesh, alpha: np.ndarray | None) -> SurfaceViewer:
+    """A viewer of the mesh past whose faces that are less than half there, by alpha [S, T], light and looks go; None:
+    all are there. Faces keep their numbers: those without area are met by no ray."""
+    if alpha is None:
+        return SurfaceViewer.of(mesh)
+    there = sample_bilinear(alpha, mesh.uvs)[mesh.face_uvs].mean(1) >= 0.5
+    return SurfaceViewer(mesh, RayScene(mesh.vertices, np.where(there[:, None], mesh.faces, mesh.faces[:, :1])))
 
 
 @compiled
 def _add_radiance(
-    face, bary, texture_face, texture_bary, shine, faces, face_uvs, uvs, albedo, specular_intensity, shade, radiance
+    face, bary, part, texture_face, texture_bary, shine, faces, face_uvs, uvs, albedo, specular_intensity, shade,
+    radiance,
 ):
-    """Adds to radiance [N, 3] what rays see: face [N] (-1: nothing), bary [N, 3], and where the texture is read;
+    """Adds to radiance [N, 3] the part [N] of what rays see: face [N] (-1: nothing), bary [N, 3], and where the texture
+    is read;
     shade [V, 6]: E and S; shine [N, 3]: S of the rays themselves where it is not negative, [0, 3]: nowhere; maps as by
     texture.sample_bilinear."""
-    one, half, size = np.float32(1.0), np.float32(0.5), len(albedo)
+    one, half, (height, width) = np.float32(1.0), np.float32(0.5), albedo.shape[:2]
     for n in range(len(face)):
         if face[n] < 0:
             continue
@@ -138,10 +188,10 @@ def _add_radiance(
         for k in range(3):
             u += texture_bary[n, k] * uvs[face_uvs[texture_face[n], k], 0]
             v += texture_bary[n, k] * uvs[face_uvs[texture_face[n], k], 1]
-        x, y = u * size - half, (one - v) * size - half
+        x, y = u * width - half, (one - v) * height - half
         left, top = int(np.floor(x)), int(np.floor(y))
         fx, fy = x - np.float32(left), y - np.float32(top)
-        right, bottom, left, top = (left + 1) % size, (top + 1) % size, left % size, top % size
+        right, bottom, left, top = (left + 1) % width, (top + 1) % height, left % width, top % height
         corners = (one - fx) * (one - fy), fx * (one - fy), (one - fx) * fy, fx * fy
         specular = (corners[0] * specular_intensity[top, left] + corners[1] * specular_intensity[top, right]
                  + corners[2] * specular_intensity[bottom, left] + corners[3] * specular_intensity[bottom, right])
@@ -154,4 +204,4 @@ def _add_radiance(
                 reflection += bary[n, k] * shade[faces[face[n], k], c + 3]
             if len(shine) > 0 and shine[n, c] >= 0.0:
                 reflection = shine[n, c]
-            radiance[n, c] += diffuse * irradiance + specular * reflection
+            radiance[n, c] += part[n] * (diffuse * irradiance + specular * reflection)

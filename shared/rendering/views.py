@@ -24,7 +24,7 @@ from shared.imaging.turning_eyes import TurningEyes
 from shared.rendering.envmap import cube_from_latlong, latlong_directions, latlong_lookup
 from shared.rendering.near_lamp import NearLamp
 from shared.rendering.precomputed_transfer import Sizes, precompute_transfer
-from shared.rendering.render import LookingEyes, SurfaceMaps, render_frame, render_lights
+from shared.rendering.render import LookingEyes, SurfaceMaps, render_frame, render_lights, seen_layers, solid_viewer
 from shared.rendering.shading import DEEP, Material, VertexShading
 from shared.rendering.split_sum import SplitSum
 from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
@@ -130,11 +130,12 @@ def light_in_head_space(envmap: np.ndarray, turn: np.ndarray) -> np.ndarray:
 class HeadViews:
     """Pictures of one solved head.
 
-    maps: diffuse_albedo [S, S, 3], specular_intensity [S, S], roughness [S, S]. cameras: all that will look at it, so
-    that only what they can see is traced; none: everything; only [V]: vertices that matter, all by default.
-    progress(items, label) wraps the trace. light_resolution: edge of the cubemap that lights are seen through; deep:
-    see VertexShading; over 1 where cavities are exact; eyes: those of the mesh, None: they do not turn; lids: actions
-    of the mesh with which they move as cameras say, None: they do not. Light on them stays what it is on open ones.
+    maps: diffuse_albedo [S, T, 3], specular_intensity [S, T], roughness [S, T], perhaps alpha [S, T]. cameras: all that
+    will look at it, so that only what they can see is traced; none: everything; only [V]: vertices that matter, all by
+    default. progress(items, label) wraps the trace. light_resolution: edge of the cubemap that lights are seen through;
+    deep: see VertexShading; over 1 where cavities are exact; eyes: those of the mesh, None: they do not turn; lids:
+    actions of the mesh with which they move as cameras say, None: they do not. Light on them stays what it is on open
+    ones.
     """
 
     def __init__(
@@ -152,8 +153,9 @@ class HeadViews:
     ):
         self.light_resolution, self.deep, self.eyes, self.lids = light_resolution, deep, eyes, lids
         self.viewer = SurfaceViewer.of(mesh)
-        self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"])
-        self.precomputed = precompute_transfer(self.viewer, sizes or Sizes())
+        self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"], maps.get("alpha"))
+        self.solid = self.viewer if self.maps.alpha is None else solid_viewer(mesh, self.maps.alpha)
+        self.precomputed = precompute_transfer(self.solid, sizes or Sizes())
         seen = np.ones(len(mesh.vertices), bool) if not cameras else self._seen(cameras)
         self.index = np.nonzero(seen if only is None else seen & only)[0]
         self.points = mesh_points(mesh, self.index)
@@ -172,7 +174,7 @@ class HeadViews:
             towards = self._towards(camera, self.viewer.mesh.vertices)
             front = np.nonzero((towards * self.viewer.normals).sum(1) > EDGE_COSINE)[0]
             starts = self.viewer.mesh.vertices[front] + RAY_START_MM * self.viewer.normals[front]
-            seen[front[~self.viewer.scene.occluded(starts, towards[front])]] = True
+            seen[front[~self.solid.scene.occluded(starts, towards[front])]] = True
         return self.viewer.grown(seen)
 
     @staticmethod
@@ -276,8 +278,9 @@ class HeadViews:
         for row in range(SAMPLES):
             for column in range(SAMPLES):
                 offsets = (column + 0.5) / SAMPLES, (row + 0.5) / SAMPLES
-                pose, lens = camera.camera_from_head, camera.intrinsics
-                covered += camera_hits(self.viewer.scene, pose, lens, *camera.size, offsets)[0] >= 0
+                for _, _, share in seen_layers(self.viewer, self.maps.alpha, camera.camera_from_head, camera.intrinsics,
+                                               camera.size, offsets):
+                    covered += share.reshape(covered.shape)
         return covered / SAMPLES**2
 
     def visibility(self, camera: ViewCamera, roughness: float) -> np.ndarray:

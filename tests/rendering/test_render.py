@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from shapes import FACING, grid_plane, sphere, turned
 
+from shared.geometry.mesh import Mesh
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import fibonacci_sphere, rigid
 from shared.imaging.image_sampling import SurfaceViewer
@@ -136,3 +137,26 @@ def test_textures_are_bilinear_and_repeat():
     colours = np.stack([texture, 2 * texture], axis=-1).astype(np.float32)
     found = sample_bilinear(colours, between)
     assert found.shape == (1, 2) and found.dtype == np.float32 and found[0, 1] == 2 * found[0, 0]
+
+
+def test_what_lets_light_through_shows_what_lies_behind():
+    """Two plates one behind the other, the front one a third there: a third of it, two thirds of the other."""
+    near, far = grid_plane(5, 100.0), grid_plane(5, 300.0)
+    both = Mesh(np.concatenate([near.vertices, far.vertices - [0.0, 0.0, 50.0]]),
+                np.concatenate([near.faces, far.faces + len(near.vertices)]),
+                np.concatenate([near.uvs * [0.5, 1.0], far.uvs * [0.5, 1.0] + [0.5, 0.0]]),
+                np.concatenate([near.face_uvs, far.face_uvs + len(near.uvs)]))
+    albedo, specular = np.full((8, 16, 3), 0.2, np.float32), np.zeros((8, 16), np.float32)
+    albedo[:, 8:], alpha = 0.8, np.full((8, 16), 1.0 / 3.0, np.float32)
+    alpha[:, 8:] = 1.0
+    pose = turned([[0.0, 0.0, 0.0]], [[0.0, 0.0, 320.0]])[0]
+    lens = np.array([[320.0, 0, 32], [0, 320.0, 32], [0, 0, 1]])
+    viewer, flat = SurfaceViewer.of(both), FlatShading(len(both.vertices))
+    radiance, coverage = render_frame(viewer, flat, SurfaceMaps(albedo, specular, alpha), 0, pose, lens, (64, 64))
+    middle = np.s_[8:56, 8:56]
+    assert np.allclose(radiance[middle], 2.0 * (0.2 / 3.0 + 0.8 * 2.0 / 3.0), rtol=1e-5)
+    assert np.allclose(coverage[middle], 1.0, atol=1e-5)
+    alone = SurfaceMaps(albedo, specular, np.where(np.arange(16) < 8, 1.0 / 3.0, 0.0)[None].repeat(8, 0).astype("f4"))
+    radiance, coverage = render_frame(viewer, flat, alone, 0, pose, lens, (64, 64))
+    assert np.allclose(radiance[middle], 2.0 * 0.2, rtol=1e-5), "pixels that are there in part are not darkened"
+    assert np.allclose(coverage[middle], 1.0 / 3.0, atol=1e-5)
