@@ -79,6 +79,8 @@ STAGE = Stage(
         Output("envmap.exr", "incident radiance, lat-long", space="world", colour_space="lin_rec709_scene"),
         Output("envmap_far.exr", "the same without the main lamp, where that stands near", space="world",
                colour_space="lin_rec709_scene", optional=True),
+        Output("hair.npz", "hair's surface, where it stands off the head, with UVs of maps/hair_*.exr", unit="mm",
+               space="head", fields=MESH, optional=True),
         Output("mesh.npz", "the refined mesh, with its face segments", unit="mm", space="head", fields=MESH),
         Output("shape.png", "tracked and refined mesh, normals and difference, from three sides", colour_space="srgb"),
         Output("poses.npz", "the head's pose in each frame, and the lens", unit="mm", fields=SOLVED_POSES),
@@ -184,7 +186,7 @@ def write_material_map(job: Job, result) -> None:
     from shared.inverse.material_map import material_image
     from shared.io.material_maps import write_material
 
-    probabilities = material_image(result.viewer, result.materials, len(result.maps["confidence"]))
+    probabilities = material_image(result.mesh, result.materials, len(result.maps["confidence"]))
     write_material(job.out / "maps" / "material.exr", probabilities, half=True, attributes={"content": "material"})
 
 
@@ -215,6 +217,7 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
     """
     import numpy as np
 
+    from shared.hair.joined import joined_maps
     from shared.inverse.frame_choice import shown_frames
     from shared.io.arrays import save_arrays
     from shared.io.images import write_exr
@@ -239,7 +242,8 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
         **({"gaze": gaze, "eye_turn": turn} if turning else {}),
         **({} if gain is None else {"gain": gain}),
     )
-    maps = SurfaceMaps(result.maps["diffuse_albedo"], result.maps["specular_intensity"])
+    seen = result.maps if result.hair is None else joined_maps(result.maps, result.hair)
+    maps = SurfaceMaps(seen["diffuse_albedo"], seen["specular_intensity"], seen.get("alpha"))
     chosen = shown_frames(len(index), job.params.render_count, clip.gaze)
     for f in job.progress(chosen, "re-rendering"):
         eyes = LookingEyes(result.eyes, turn[f]) if turning else None
@@ -289,6 +293,7 @@ def run(job: Job) -> None:
 
     from shared.compute.processor import use_baseline_opencv
     from shared.compute.run_context import RunContext
+    from shared.hair.hair_files import write_hair
     from shared.inverse.clip_inputs import read_mean_texture
     from shared.inverse.joint_clips import join_clips
     from shared.inverse.parameters import read_settings
@@ -317,7 +322,9 @@ def run(job: Job) -> None:
         job.warn(text)
     write_maps(job, result)
     write_material_map(job, result)
-    write_shape(job, surface, result.viewer.mesh)
+    write_shape(job, surface, result.mesh)
+    if result.hair is not None:
+        write_hair(job.out, result.hair)
     lights, own = np.split(result.solution.state.light, len(clips)), []
     for k, (clip, rows) in enumerate(zip(clips, views.frames_of_lights, strict=True)):
         folder = job.out / "clips" / job.clips[k] if k else job.out

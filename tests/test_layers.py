@@ -22,6 +22,7 @@ MAY_IMPORT = {
     "shared.imaging": "compute geometry",
     "shared.io": "geometry imaging",
     "shared.capture": "contract compute geometry imaging io",
+    "shared.hair": "compute geometry imaging io",
     "shared.tracking": "contract compute geometry io capture",
     "shared.actions": "geometry tracking",
     "shared.rendering": "compute geometry imaging",
@@ -30,7 +31,7 @@ MAY_IMPORT = {
     "shared.selection": "appearance",
     "shared.published": "compute geometry imaging rendering appearance",
     "shared.inverse":
-        "contract compute geometry imaging io capture tracking rendering appearance shape selection published",
+        "contract compute geometry imaging io capture hair tracking rendering appearance shape selection published",
     "shared.report": "contract geometry imaging io capture tracking rendering",
     "stages": "shared",
     "tools.cli": "shared stages",

@@ -320,6 +320,12 @@ SOLVE = (
           unit="deg", optional=True),
     Field("poses.turned_deg", "How far they turned in all, rms.", unit="deg", optional=True),
     *_LAMP,
+    Field("hair", "Hair that stands off the head and has a surface of its own; absent where the head's own surface "
+          "meets the outline.", "", optional=True),
+    Field("hair.thickness_mm", "Median distance from the head, where outlines tell it.", unit="mm"),
+    Field("hair.skull_covered", "Share of the skull that it covers."),
+    Field("hair.seen_share", "Share of its map that some frame looks at."),
+    Field("hair.lowest_mm", "Its lower end over the chin; negative below it.", unit="mm"),
     Field("catchlights", "The brightest spots on the irises beside those of the solved light; absent where no open eye "
           "is seen.", "", optional=True),
     Field("catchlights.irises", "Irises that were looked at: of both eyes, in so many frames.", "int"),

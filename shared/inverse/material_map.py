@@ -8,6 +8,7 @@ from shared.appearance.material_features import surface_features
 from shared.appearance.material_mixture import material_probabilities
 from shared.appearance.problem import AppearanceState
 from shared.compute.run_context import SILENT, RunContext
+from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.material_labels import CLOTH, HAIR, UNKNOWN
@@ -36,9 +37,9 @@ def clip_materials(viewer: SurfaceViewer, shading: VertexShading, views: Views, 
     return material_probabilities(surface.with_mesh(viewer.mesh), features)
 
 
-def material_image(viewer: SurfaceViewer, materials: np.ndarray, size: int) -> np.ndarray:
+def material_image(mesh: Mesh, materials: np.ndarray, size: int) -> np.ndarray:
     """[size, size, len(LABELS)] float32, gutters filled, of the vertices' materials [V, len(LABELS)]."""
-    texels = TexelSurface(viewer.mesh, size)
+    texels = TexelSurface(mesh, size)
     return texels.dilated(texels.to_image(texels.interpolate(materials)))
 
 

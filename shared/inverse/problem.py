@@ -11,7 +11,9 @@ from shared.appearance.observations import face_front
 from shared.appearance.problem import AppearanceSettings
 from shared.appearance.texture import TexelMaterial
 from shared.compute.run_context import RunContext
+from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface
+from shared.hair.joined import HairSurface
 from shared.imaging.frame_index import hold_out, spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.turning_eyes import TurningEyes
@@ -54,14 +56,16 @@ class InverseSettings:
 
 @dataclass(frozen=True)
 class InverseResult:
-    """solution of the appearance fit, the texels' material, maps by name, the vertices' shading in all views, the
-    viewer of the final mesh, what its vertices show [V, len(LABELS)], the views with their poses and which were fitted,
-    and what is worth recording; covariance [F, 6, 6] of poses that were tracked again, None: they are as they were
-    given; eyes: those of the mesh, which turn with the views' gaze, None: they do not."""
+    """solution of the appearance fit, the texels' material, maps by name, the head's final mesh, the vertices' shading
+    in all views, the viewer of the mesh, what its vertices show [V, len(LABELS)], the views with their poses and which
+    were fitted, and what is worth recording; covariance [F, 6, 6] of poses that were tracked again, None: they are as
+    they were given; eyes: those of the mesh, which turn with the views' gaze, None: they do not; hair: where it has a
+    surface of its own, which viewer and shading then have, too, after the head."""
 
     solution: Solution
     material: TexelMaterial
     maps: dict[str, np.ndarray]
+    mesh: Mesh
     shading: VertexShading
     viewer: SurfaceViewer
     materials: np.ndarray
@@ -69,6 +73,7 @@ class InverseResult:
     record: dict
     covariance: np.ndarray | None = None
     eyes: TurningEyes | None = None
+    hair: HairSurface | None = None
 
 
 def some_views(views: Views, settings: InverseSettings, wanted: int) -> Views:

@@ -188,7 +188,7 @@ def conclude(
         "warnings": [],
     }
     materials = clip_materials(viewer, shading, views, surface, state, context)
-    return InverseResult(solution, material, maps, shading, viewer, materials, views, record)
+    return InverseResult(solution, material, maps, viewer.mesh, shading, viewer, materials, views, record)
 
 
 def map_material(solver: ReferenceSolver, average: Average) -> TexelMaterial:

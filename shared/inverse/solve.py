@@ -7,52 +7,38 @@ from dataclasses import replace
 
 import numpy as np
 
-from shared.appearance.catchlights import check_catchlights
 from shared.appearance.chart_scale import ChartStatement, describe_scale, scale_warnings, state_chart
 from shared.appearance.diagnostics import diagnostic_warnings, diagnostics_of, face_regions
 from shared.appearance.eye_whites import describe_whites
-from shared.appearance.fine_normals import NormalPass, resolved_texels
 from shared.appearance.fit import Solution, fit_all_points, fit_appearance
 from shared.appearance.light_models import SeveralLights
 from shared.appearance.local_roughness import local_roughness
-from shared.appearance.maps import make_maps
 from shared.appearance.problem import AppearanceProblem, AppearanceSettings
 from shared.appearance.projection import ROUGHNESS_RANGE, SPECULAR_RANGE, reached_end
-from shared.appearance.texture_pass import TexturePass
 from shared.capture.chart import ChartObservation
 from shared.compute.run_context import SILENT, RunContext
-from shared.geometry.mesh import diffused
 from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
-from shared.imaging.texels import TexelSurface
-from shared.imaging.turning_eyes import LIDS, EyeTexels, TurningEyes
 from shared.imaging.views import Views
 from shared.inverse.clip_inputs import TrackedPoses
 from shared.inverse.exposure import exposure_warnings, solve_exposure
 from shared.inverse.lamp_distance import describe_lamp, find_lamp
 from shared.inverse.lit_surface import LitSurface, report_to
-from shared.inverse.material_map import clip_materials, hidden_places, matt_share
 from shared.inverse.model_selection import select
 from shared.inverse.problem import (
-    FACE_SKIN,
     InverseResult,
     InverseSettings,
     frames_to_fit,
-    shade_vertices,
     some_views,
 )
 from shared.inverse.published_clip import solve_by_reference
 from shared.inverse.shaping import shape_and_turn
-from shared.rendering.eye_shine import EyeShine
-from shared.shape.gauss_newton import typical_edge
+from shared.inverse.solve_texels import solve_texels
 from shared.shape.refine import meet_outline, surface_error
+from shared.shape.silhouette import LEAST_MET
 
 LEAST_SEEN_SHARE = 0.01
 """Of the map: a clip that shows less of it gives no result, and one that determines less gives a warning."""
-SPECULAR_WIDTHS = (np.inf, 1 / 16, 1 / 64)
-"""Relative to the map: over which texels share their specular intensity, for held-out frames to choose from."""
-HAIRLINE_MM = 10.0
-"""Bends of the hairline shorter than this are the mesh's, not the hair's."""
 
 
 def solve_clip(
@@ -114,50 +100,24 @@ def solve_clip(
     viewer = lit.viewer.within_rim(surface_error(surface.tracks))
     covariance, pose_record = shaped.covariance, shaped.pose_record
     lit = shaped = None  # texels need the memory that the points' samples and transfer take
-    shading = shade_vertices(views, viewer, precomputed, settings.appearance, solution, context)
-    texels = TexelSurface(surface.mesh, settings.map_size)
-    eyes = None if views.gaze is None else TurningEyes.of(surface)
-    eye_texels = None if eyes is None else EyeTexels(texels, viewer, eyes, surface.faces_of(LIDS))
+    stands_off = outline.get("met", 1.0) < LEAST_MET
+    texels = solve_texels(views, surface, viewer, precomputed, settings, solution, stands_off, context)
     typical = np.median(solution.state.albedo, axis=0)
-    materials = clip_materials(viewer, shading, views, surface, solution.state, context)
-    scalp, hidden, matt = scalp_of(surface), None, None
-    if scalp is not None:
-        hidden = hidden_places(viewer, surface, materials)
-        matt = matt_share(viewer, surface, materials, hidden, scalp)
-    texture = TexturePass(
-        texels, viewer, shading, views, specular=solution.state.specular, typical_albedo=typical,
-        light_weights=solution.light_weights, region=scalp, bare=surface.vertices_of(FACE_SKIN), hidden=hidden,
-        matt=matt, context=context, eyes=eye_texels,
-    )
-    widths = settings.map_size * np.array(SPECULAR_WIDTHS if settings.appearance.specular else (np.inf,))
-    material, texture_record = texture.run(widths)
-    turn, relief = None, {}
-    if settings.normal_map:
-        fine = NormalPass(texels, viewer, shading, views, material, context)
-        turn, relief = fine.run(resolved_texels(texels, views))
-        if eye_texels is not None:
-            turn[eye_texels.rows] = 0.0  # it was seen where the texel does not stay
-        context.note(f"fine normals: {relief}")
-    catchlights = None if eyes is None else check_catchlights(views, eyes, EyeShine(viewer, shading, eyes))
-    roughness, local = solution.state.roughness, solution.local_roughness_fit
-    roughness = roughness if local is None else local.roughness(surface.mesh.vertices)
     record = {
-        "texture": texture_record,
+        **texels.record,
         "shape": {**shape_record, "outline": outline},
         "poses": pose_record,
         "exposure": {} if exposure is None else exposure.record,
         "lamp": describe_lamp(solution.lamp, solution.state.light, by_lamp.record, views,
                               settings.appearance.light_moves(views.moves)),
-        "relief": relief,
         "diagnostics": diagnostics,
-        "catchlights": catchlights,
         "warnings": [*filter(None, [chart_warning]), *scale_warnings(chart, typical),
                      *exposure_warnings(exposure), *diagnostic_warnings(diagnostics, views.moves)],
         "albedo_scale": describe_scale(chart, typical, whites, solution.scale),
         "model_selection": () if selected is None else selected.candidates,
     }
-    maps = make_maps(texels, material, roughness, turn, None if eye_texels is None else eye_texels.rows)
-    return InverseResult(solution, material, maps, shading, viewer, materials, views, record, covariance, eyes)
+    return InverseResult(solution, texels.material, texels.maps, texels.mesh, texels.shading, texels.viewer,
+                         texels.materials, views, record, covariance, texels.eyes, texels.hair)
 
 
 def said_by_chart(
@@ -193,16 +153,6 @@ def examine(
     return diagnostics, solution, whites
 
 
-def scalp_of(surface: Surface) -> np.ndarray | None:
-    """[V] bool: vertices of the scalp, whose hair says nothing of the skin, within a border as smooth as a hairline;
-    None where the mesh has no segments."""
-    if surface.face_segment is None:
-        return None
-    faces = surface.mesh.faces
-    steps = round((HAIRLINE_MM / typical_edge(surface.mesh.vertices, faces)) ** 2)
-    return diffused(surface.vertices_of(("scalp",)).astype(float), faces, steps) > 0.5
-
-
 def describe_light(state) -> str:
     """The light's model in words."""
     model, numbers = state.light_model, len(state.params)
@@ -234,6 +184,7 @@ def summarise(result: InverseResult, moves: str) -> dict:
         **{key: result.record[key] for key in ("shape", "poses", "relief", "diagnostics") if key in result.record},
         **({"exposure": exposure} if (exposure := result.record.get("exposure")) else {}),
         **({"lamp": lamp} if (lamp := result.record.get("lamp")) else {}),
+        **({"hair": hair} if (hair := result.record.get("hair")) else {}),
         **({"catchlights": found} if (found := result.record.get("catchlights")) else {}),
         **({"model_selection": [dict(candidate) for candidate in tried]} if tried else {}),
         "iterations": list(solution.iterations),

@@ -92,6 +92,6 @@ def test_materials_as_a_map_sum_to_one():
     materials = all_of(surface)
     left = surface.mesh.vertices[:, 0] > 0
     materials[left, SKIN], materials[~left, HAIR] = 1.0, 1.0
-    image = material_image(viewer, materials, 64)
+    image = material_image(viewer.mesh, materials, 64)
     assert image.shape == (64, 64, len(LABELS)) and np.allclose(image.sum(2), 1.0, atol=1e-5)
     assert (image[..., SKIN] > 0.99).any() and (image[..., HAIR] > 0.99).any() and image[..., UNKNOWN].max() == 0.0

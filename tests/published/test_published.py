@@ -126,7 +126,7 @@ def test_vertices_move_towards_the_outline(clip):
     assert field_faults(record, SOLVE) == []
     assert {f"iterations[].{name}" for name in ("iteration", "image", "mask", "laplacian", "white_light", "diffuse",
                                                 "roughness_variation")} <= written_fields(record, SOLVE)
-    moved = result.viewer.mesh.vertices
+    moved = result.mesh.vertices
     rim = np.abs(clip.mesh.vertices[:, 0]) > 60.0
     before = np.linalg.norm(small.mesh.vertices[rim] - clip.mesh.vertices[rim], axis=1).mean()
     after = np.linalg.norm(moved[rim] - clip.mesh.vertices[rim], axis=1).mean()

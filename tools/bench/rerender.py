@@ -18,6 +18,7 @@ from shared.geometry.blend_shapes import LID_ACTIONS, LidActions
 from shared.geometry.mesh import interpolate
 from shared.geometry.raycast import camera_hits
 from shared.geometry.surface import Surface
+from shared.hair.joined import HAIR_SEGMENT
 from shared.imaging.color import CLIPPED_CODE
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.material_labels import SKIN
@@ -40,6 +41,8 @@ REGIONS = {"skin": FACE_SKIN, "eyes": ("eyes", "eye_sockets", "lids"), "lips": (
 segments the map of materials calls skin: no beard, and no hair that falls over a cheek."""
 SIZES = Sizes(directions=768, nodes=700)
 RELIT_UNDER = "low_sun"
+FILLED = 0.99
+"""Share of a pixel from which on head and hair fill it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +67,16 @@ class SolvedClip:
         if segment is None:
             raise InputError("the mesh has no face segments", where=str(work / "inverse_render" / "mesh.npz"))
         names = read_json(work / "track_landmarks" / "tracking.json")["segments"]
+        count = len(self.asset.mesh.faces) - len(segment)
+        segment, names = np.concatenate([segment, np.full(count, len(names))]), (*names, HAIR_SEGMENT)
         self.segment_names = np.array(names)[segment]
-        self.is_skin = (read_material(work / "inverse_render" / "maps" / "material.exr").argmax(2) == SKIN)[..., None]
+        is_skin = (read_material(work / "inverse_render" / "maps" / "material.exr").argmax(2) == SKIN)[..., None]
+        self.is_skin = np.concatenate([is_skin, np.zeros_like(is_skin)], axis=1) if count else is_skin
         cameras = [item.camera for item in self.held_out]
         turn = any(camera.gaze is not None for camera in cameras)
         eyes = TurningEyes.of(Surface(self.asset.mesh, segment, tuple(names))) if turn else None
-        moving = facial_actions(load_head_model(), self.asset.mesh.vertices, self.asset.mesh.faces, LID_ACTIONS)
+        head = self.asset.mesh.faces[: len(segment) - count]
+        moving = facial_actions(load_head_model(), self.asset.mesh.vertices[: head.max() + 1], head, LID_ACTIONS)
         lids = LidActions.of(moving)
         self.views = HeadViews(self.asset.mesh, self.asset.maps, SIZES, cameras, eyes=eyes, lids=lids)
 
@@ -128,9 +135,9 @@ def is_clipped(codes: np.ndarray) -> np.ndarray:
 
 
 def filled_and_unclipped(codes: np.ndarray, mask: np.ndarray, coverage: np.ndarray) -> np.ndarray:
-    """[H, W] bool: pixels that the head's mesh fills (coverage [H, W] of 1), inside the person mask [H, W] and not
+    """[H, W] bool: pixels that head and hair fill (coverage [H, W]), inside the person mask [H, W] and not
     clipped in any channel of codes [H, W, 3]."""
-    return (coverage == 1.0) & (mask > 0) & ~is_clipped(codes)
+    return (coverage > FILLED) & (mask > 0) & ~is_clipped(codes)
 
 
 def region_pixels(shown: np.ndarray, sure: np.ndarray) -> dict[str, np.ndarray]:

@@ -14,6 +14,8 @@ from shared.geometry.eyeballs import fit_eyeball, pitch_from_rest
 from shared.geometry.mesh import Mesh, midpoint_subdivision
 from shared.geometry.parts import EYES, head_parts
 from shared.geometry.transforms import WORLD_FROM_CAMERA, rotation_from_vector
+from shared.hair.hair_files import read_hair
+from shared.hair.joined import joined_maps, joined_mesh
 from shared.imaging.turning_eyes import TurningEyes
 from shared.io.arrays import load_arrays, read_json
 from shared.io.exr_picture import read_rec709
@@ -31,7 +33,8 @@ _LARGEST_LIGHT = 8192
 
 @dataclass(frozen=True)
 class Asset:
-    """What is to be lit: mesh (mm, y up, facing +z) and maps by name; of a result also its light, poses [F, 4, 4] with
+    """What is to be lit: mesh (mm, y up, facing +z) and maps by name, of the head and of hair that has a surface of its
+    own, whose vertices and faces then come last; of a result also its light, poses [F, 4, 4] with
     frame_index [F], intrinsics [3, 3] of the source frame, what moved in the clip, its light's lamp where that stands
     near; of an export with a gaze, the eyes, and how they turn in each frame, eye_turn [F, 2, 2] radians; of one whose
     lids move, the actions that move them, how far its eyes are shut, shut [F, 2], and how far they look up from where
@@ -87,15 +90,19 @@ def _open_result(path: Path) -> Asset:
     for name in ("camera_from_head", "frame_index", "intrinsics"):
         if name not in arrays:
             raise InputError(f"no {name}", where=str(folder / "poses.npz"), got=", ".join(sorted(arrays)))
+    maps = {name: _read_map(folder / "maps", name) for name in MAPS}
+    head = mesh
+    if (hair := read_hair(folder)) is not None:
+        mesh, maps = joined_mesh(mesh, hair.mesh), joined_maps(maps, hair)
     return Asset(
         mesh,
-        {name: _read_map(folder / "maps", name) for name in MAPS},
+        maps,
         read_rec709(folder / "envmap.exr"),
         arrays["camera_from_head"].astype(np.float64),
         arrays["frame_index"],
         arrays["intrinsics"].astype(np.float64),
         *_light_of_clip(folder),
-        **_eyes_of_clip(folder, mesh, arrays),
+        **_eyes_of_clip(folder, head, mesh, arrays),
     )
 
 
@@ -118,16 +125,17 @@ def _light_of_clip(folder: Path) -> tuple[str, NearLamp | None]:
     raise InputError("neither run.json nor solve.json", where=str(folder), hint="name a complete result")
 
 
-def _eyes_of_clip(folder: Path, mesh: Mesh, poses: dict[str, np.ndarray]) -> dict:
-    """The fields of Asset for the eyes and lids of an export; none where the gaze is not known."""
+def _eyes_of_clip(folder: Path, head: Mesh, mesh: Mesh, poses: dict[str, np.ndarray]) -> dict:
+    """The fields of Asset for the eyes and lids of an export; none where the gaze is not known. mesh: the head's,
+    perhaps with more after it."""
     if "eye_turn" not in poses or not (folder / "mesh.obj").is_file():
         return {}
     groups = read_obj_groups(folder / "mesh.obj")
-    balls = tuple(fit_eyeball(mesh, groups[name]) for name in EYES)
+    balls = tuple(fit_eyeball(head, groups[name]) for name in EYES)
     found = {"eyes": TurningEyes(mesh, balls), "eye_turn": poses["eye_turn"]}
     lids = None
     if {"lids", "gaze"} <= poses.keys() and (folder / "head.usda").is_file():
-        lids = LidActions.of(read_actions(folder / "head.usda", head_parts(mesh, balls)[0].vertices, LID_ACTIONS))
+        lids = LidActions.of(read_actions(folder / "head.usda", head_parts(head, balls)[0].vertices, LID_ACTIONS))
     if lids is not None:
         found |= {"lids": lids, "shut": poses["lids"], "pitch": pitch_from_rest(poses["gaze"])}
     return found

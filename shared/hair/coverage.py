@@ -1,0 +1,93 @@
+"""How much of a shell about the head is hair: alpha, by what frames show where it lies.
+
+Each texel of the shell is looked at in all frames that face it; what is hair in most of them is hair. Hair grows
+downwards: what is not connected to the crown is something else. Where no frame looks, hair goes on as it is beside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.csgraph import connected_components
+
+from shared.geometry.mesh import diffused, mesh_edges
+from shared.hair.shell_grid import ShellGrid
+from shared.imaging.image_sampling import Picture, SurfaceViewer
+from shared.imaging.texels import TexelSurface
+from shared.imaging.views import Views
+
+LEAST_SEEN, SEEN_WELL = 0.05, 1.0
+"""Sum of squared view cosines over frames, in frames, from which on a texel speaks for itself, and a vertex for its
+surroundings."""
+BESIDE = 0.25, 0.5
+"""Squared view cosine up to which a place that shows the background is one where the shell is a little too wide, and
+from which on there is no hair."""
+HELD, GOES_ON = 10.0, (3.0, 0.5)
+"""How much what is seen counts beside one step from place to place, and such steps around and down: unseen, hair ends
+where it does beside."""
+EDGE = 0.4, 0.7
+"""Share of the frames that show hair from which on something, and everything, of a texel is hair."""
+LEAST_COSINE = 0.05
+"""Of a look that tells where hair ends: at its border it curves away."""
+BORDER_STEPS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class SeenHair:
+    """Of a shell's texels: how often frames look at them, by squared view cosine [T], and how much of that is hair
+    [T]."""
+
+    looks: np.ndarray
+    hair: np.ndarray
+
+
+def look_for_hair(grid: ShellGrid, texels: TexelSurface, kinds: Mapping[int, np.ndarray], views: Views) -> SeenHair:
+    """What frames show at the shell's texels; kinds {frame: [H, W, 3]}: share of hair, skin and cloth in its pixels, 0
+    of all where there is nobody. About the skull the background says nothing: the shell is a little too wide there."""
+    viewer = SurfaceViewer.of(texels.mesh)
+    viewer.least_cosine = LEAST_COSINE
+    looks, hair = np.zeros((2, len(texels)))
+    hangs = np.repeat((np.arange(len(grid.base)) >= grid.domed)[:, None], grid.columns, 1)
+    hangs = texels.interpolate(grid.of_vertices(hangs.astype(np.float32))[:, None])[:, 0]
+    for f, shares in kinds.items():
+        lens = views.intrinsics[f]
+        picture = Picture((shares,), np.zeros(shares.shape, np.int8), np.ones(shares.shape[:2], np.float32))
+        view = viewer.view(views.camera_from_head[f], lens, shares.shape[1::-1])
+        samples, _ = texels.samples(texels.frame_view(view, picture, lens))
+        share, weight = np.clip(samples.colours, 0.0, 1.0), samples.weight
+        person = share.sum(1).clip(max=1.0)
+        facing = hangs[samples.rows] * np.clip((weight - BESIDE[0]) / (BESIDE[1] - BESIDE[0]), 0.0, 1.0)
+        looks[samples.rows] += weight * (person + (1.0 - person) * facing)
+        hair[samples.rows] += weight * share[:, 0]
+    return SeenHair(looks, hair)
+
+
+def covered(grid: ShellGrid, texels: TexelSurface, seen: SeenHair) -> np.ndarray:
+    """[V] in 0 .. 1 of the shell's vertices: how much hair there is, also where no frame looks."""
+    means, weight = texels.to_vertices((seen.hair / np.maximum(seen.looks, 1e-9))[:, None], seen.looks[:, None])
+    means, weight = grid.of_grid(means[:, 0]), grid.of_grid(weight[:, 0])
+    known = weight / (weight + SEEN_WELL)
+    share = np.clip(grid.smoothest(means, HELD * known, 0.0, *GOES_ON), 0.0, 1.0)
+    share = grid.of_vertices(share)
+    edges = mesh_edges(texels.mesh.faces)[0]
+    both = (share[edges] > 0.5).all(1)
+    count = len(share)
+    graph = sparse.coo_matrix((np.ones(both.sum()), edges[both].T), shape=(count, count))
+    _, part = connected_components(graph, directed=False)
+    top = part[grid.of_grid(np.arange(count))[: grid.domed // 2].ravel()]
+    grown = (part == np.bincount(top).argmax()) & (share > 0.5)
+    return share * (diffused(grown.astype(float), texels.mesh.faces, BORDER_STEPS) > 0.0)
+
+
+def alpha_of(texels: TexelSurface, seen: SeenHair, share: np.ndarray) -> np.ndarray:
+    """[T] float32 in 0 .. 1: the share of hair at texels, sharper than frames that are a little apart have it; share
+    [V]: at the vertices, which speaks where frames do not look."""
+    around = texels.interpolate(share[:, None])[:, 0]
+    own = (seen.hair + LEAST_SEEN * around) / (seen.looks + LEAST_SEEN)
+    own = np.where(around > 0.0, own, 0.0)
+    low, high = EDGE
+    step = np.clip((own - low) / (high - low), 0.0, 1.0)
+    return (step * step * (3.0 - 2.0 * step)).astype(np.float32)

@@ -1,0 +1,182 @@
+"""Hair that stands off the head of a solved clip: its surface, its alpha, its albedo, and the light on both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from shared.appearance.fit import Solution
+from shared.appearance.problem import AppearanceSettings
+from shared.appearance.texture_pass import TexturePass
+from shared.compute.run_context import SILENT, RunContext
+from shared.geometry.mesh import Mesh
+from shared.geometry.surface import Surface
+from shared.hair.coverage import alpha_of, covered, look_for_hair
+from shared.hair.hair_pixels import CLOTH_PIXEL, HairPixels
+from shared.hair.hull import LEAST_MM, hull_radius
+from shared.hair.joined import HairSurface, joined_surface
+from shared.hair.shell_grid import ShellGrid
+from shared.imaging.frame_index import spread_frames
+from shared.imaging.image_sampling import SurfaceViewer, sample_colours
+from shared.imaging.texels import TexelSurface
+from shared.imaging.views import Views
+from shared.inverse.problem import shade_vertices
+from shared.rendering.precomputed_transfer import PrecomputedTransfer, Sizes, precompute_transfer
+from shared.rendering.render import solid_viewer
+from shared.rendering.shading import VertexShading
+
+FRAMES, COLOUR_FRAMES = 24, 8
+"""That hair is looked for in, and that its mean colour is taken from."""
+ABOVE_EARS_MM, BELOW_CHIN_MM = 20.0, 110.0
+"""The skull's centre over the middle of the ears; and how far down hair is looked for."""
+COARSE = 256
+"""Texels along the edge of the map by which it is first told where hair is."""
+LEAST_DOME = 0.3
+"""Share of the skull's grid that hair has to cover to be more than what a scalp shows by itself."""
+LEAST_SHARE, SURE = 0.2, 0.8
+"""Of hair at a face's corners below which there is no surface, and from which on its colour is hair's."""
+BENEATH = ("scalp", "ears", "forehead")
+"""Segments that hair may press flat."""
+GAP_MM = 1.0
+"""Between hair and what it presses flat."""
+
+
+@dataclass(frozen=True, eq=False)
+class StandingHair:
+    """mesh: hair's surface, in head space; share [V] of hair at its vertices; alpha [S, S] of its map; head: the head's
+    mesh with the scalp and the ears that lie beneath pressed flat; record: what is worth recording."""
+
+    mesh: Mesh
+    share: np.ndarray
+    alpha: np.ndarray
+    head: Mesh
+    record: dict
+
+
+@dataclass(frozen=True, eq=False)
+class HairyHead:
+    """Head and hair under the clip's light: one surface, whose first vertices and faces are the head's; viewer,
+    shading: of all of it, light and looks going past what is not half there; head, hair: meshes of all vertices and of
+    one's faces, with the UVs of its own maps."""
+
+    surface: Surface
+    viewer: SurfaceViewer
+    shading: VertexShading
+    head: Mesh
+    hair: Mesh
+
+    def with_hair(self, values: np.ndarray) -> np.ndarray:
+        """[V, ...]: values [N, ...] of the head's vertices, with 0 at the hair's."""
+        missing = len(self.surface.mesh.vertices) - len(values)
+        return np.concatenate([values, np.zeros((missing, *values.shape[1:]), values.dtype)])
+
+
+def find_hair(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray, views: Views, size: int,
+              context: RunContext = SILENT) -> StandingHair | None:
+    """None where it covers too little of the skull to be told from a scalp.
+
+    viewer: of the solved head, surface: with its segments; materials [V, len(LABELS)]; size: edge of hair's map.
+    """
+    ears = viewer.mesh.vertices[surface.vertices_of(("ears",))].mean(0)
+    centre = np.array([0.0, ears[1] + ABOVE_EARS_MM, ears[2]])
+    fitted = np.nonzero(views.fitted)[0]
+    frames = fitted[spread_frames(len(fitted), FRAMES, views.light_index[fitted])]
+    pixels = HairPixels(viewer, surface, materials, views, centre)
+    pixels.learn(frames)
+    kinds, solids = {}, {}
+    for f in context.progress(frames, "hair"):
+        kinds[f], mesh = pixels.probabilities(f)
+        inner = cv2.erode(mesh.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
+        solids[f] = np.maximum(kinds[f].sum(-1) - kinds[f][..., CLOTH_PIXEL], inner)
+    grid = ShellGrid.about(viewer.scene, surface.faces_of(("ears",)), centre, pixels.chin_mm - BELOW_CHIN_MM)
+    radius, _ = hull_radius(grid, solids, views)
+    shell = TexelSurface(grid.mesh(radius), COARSE)
+    share = grid.of_grid(covered(grid, shell, look_for_hair(grid, shell, kinds, views)))
+    dome = float((share[: grid.domed] > 0.5).mean())
+    if dome < LEAST_DOME:
+        context.note(f"hair: it covers {dome:.0%} of the skull at most: no surface of its own")
+        return None
+    # Where hair ends on the skin, beside forehead and cheeks, it lies on it.
+    bare = (share < 0.5) & (grid.centres[..., 1] > pixels.chin_mm)
+    radius, said = hull_radius(grid, solids, views, bare)
+    shell = TexelSurface(grid.mesh(radius), size)
+    seen = look_for_hair(grid, shell, kinds, views)
+    share = covered(grid, shell, seen)
+    alpha = shell.dilated(shell.to_image(alpha_of(shell, seen, share)))
+    head = _pressed(viewer.mesh, surface, grid, radius, grid.of_grid(share))
+    kept = (share > LEAST_SHARE)[shell.mesh.faces].any(1)
+    mesh, used = _part(shell.mesh, kept)
+    thick = (radius - grid.base)[(grid.of_grid(share) > 0.5) & (said > 0.0)]
+    record = {"thickness_mm": round(float(np.median(thick)), 1), "skull_covered": round(dome, 3),
+              "seen_share": round(float((seen.looks > 0).mean()), 3),
+              "lowest_mm": round(float(mesh.vertices[:, 1].min() - pixels.chin_mm), 1)}
+    context.note(f"hair: a surface of its own, {record}")
+    return StandingHair(mesh, share[used], alpha, head, record)
+
+
+def light_hair(hair: StandingHair, surface: Surface, views: Views, precomputed: PrecomputedTransfer, sizes: Sizes,
+               appearance: AppearanceSettings, solution: Solution, error_mm: float, context: RunContext) -> HairyHead:
+    """Both under the solved light, shading each other. surface, precomputed: the head's; error_mm: of its surface."""
+    before = precomputed.nodes.points.positions
+    both = joined_surface(surface.with_mesh(hair.head), hair.mesh)
+    alpha = np.concatenate([np.ones_like(hair.alpha), hair.alpha], axis=1)
+    viewer = solid_viewer(both.mesh, alpha).within_rim(error_mm)
+    again = precompute_transfer(viewer, sizes, precomputed.visibility, precomputed.directions)
+    places = again.nodes.points.positions
+    nearest = np.argmin(((places[:, None] - before) ** 2).sum(-1), axis=1)
+    state = replace(solution.state, node_albedo=solution.state.node_albedo[nearest])
+    shading = shade_vertices(views, viewer, again, appearance, replace(solution, state=state), context)
+    count, joined = len(surface.mesh.faces), both.mesh
+    head = Mesh(joined.vertices, joined.faces[:count], surface.mesh.uvs, surface.mesh.face_uvs)
+    own = Mesh(joined.vertices, joined.faces[count:], hair.mesh.uvs, hair.mesh.face_uvs)
+    return HairyHead(both, viewer, shading, head, own)
+
+
+def texture_hair(hair: StandingHair, lit: HairyHead, views: Views, context: RunContext) -> HairSurface:
+    """The surface with an albedo: no highlights, since its strands have others than a surface."""
+    texels = TexelSurface(lit.hair, len(hair.alpha))
+    share = np.zeros(len(lit.surface.mesh.vertices))
+    share[-len(hair.share):] = hair.share
+    typical = _typical_albedo(lit, share > SURE, views)
+    texture = TexturePass(texels, lit.viewer, lit.shading, views, specular=0.0, typical_albedo=typical,
+                          hidden=1.0 - share, matt=np.ones(len(share)), context=context)
+    material, _ = texture.run((np.inf,))
+    albedo = texels.dilated(texels.to_image(material.albedo.astype(np.float32)))
+    return HairSurface(hair.mesh, albedo, hair.alpha)
+
+
+def _typical_albedo(lit: HairyHead, chosen: np.ndarray, views: Views) -> np.ndarray:
+    """[3] median over frames and the chosen vertices [V] bool."""
+    found = []
+    fitted = np.nonzero(views.fitted)[0]
+    for f in fitted[spread_frames(len(fitted), COLOUR_FRAMES)]:
+        picture = views.picture(f)
+        view = lit.viewer.view(views.camera_from_head[f], views.intrinsics[f], views.size)
+        rows = np.nonzero(chosen & (view.weight > 0.0))[0]
+        light = np.maximum(lit.shading.irradiance(f)[rows], 1e-4)
+        found.append(sample_colours(picture, view.pixels[rows]) / light)
+    return np.clip(np.median(np.concatenate(found), axis=0), 0.005, 0.9)
+
+
+def _pressed(mesh: Mesh, surface: Surface, grid: ShellGrid, radius: np.ndarray, share: np.ndarray) -> Mesh:
+    """The head's mesh with what comes out of hair that covers it pressed beneath. radius, share [R, C] of the grid."""
+    places = np.array(mesh.vertices)
+    index = np.nonzero(surface.vertices_of(BENEATH))[0]
+    row, column, out = grid.locate(places[index])
+    most = grid.read(radius, row, column) - GAP_MM
+    over = (grid.read(share, row, column) > 0.5) & (out > most)
+    axis = np.where((row < grid.domed - 1)[:, None], grid.centre, places[index] * [0, 1, 0] + grid.centre * [1, 0, 1])
+    shrink = np.where(over, np.maximum(most, LEAST_MM) / np.maximum(out, 1e-6), 1.0)
+    places[index] = axis + shrink[:, None] * (places[index] - axis)
+    return mesh.replace(vertices=places)
+
+
+def _part(mesh: Mesh, kept: np.ndarray) -> tuple[Mesh, np.ndarray]:
+    """Some of the faces, kept [F] bool, with the vertices that they use, and which ones these are [V]."""
+    used, corners = np.unique(mesh.faces[kept], return_inverse=True)
+    uvs, texture = np.unique(mesh.face_uvs[kept], return_inverse=True)
+    part = Mesh(mesh.vertices[used], corners.reshape(-1, 3).astype(np.int32), mesh.uvs[uvs],
+                texture.reshape(-1, 3).astype(np.int32))
+    return part, used

@@ -1,0 +1,90 @@
+"""What of a shell about a ball is hair, by pictures in which an upper part shows hair and the rest skin."""
+
+import numpy as np
+import pytest
+from shapes import nods, sphere
+
+from shared.geometry.raycast import RayScene, camera_hits, pixel_directions
+from shared.hair.coverage import alpha_of, covered, look_for_hair
+from shared.hair.shell_grid import ShellGrid
+from shared.imaging.texels import TexelSurface
+from shared.imaging.views import Views
+
+LENS = np.array([[500.0, 0, 80], [0, 500.0, 80], [0, 0, 1]])
+SIZE = (160, 160)
+SHELL_MM = 88.0
+HAIRLINE_MM = 20.0
+
+
+@pytest.fixture(scope="module")
+def shell():
+    head = sphere(80.0, 4)
+    grid = ShellGrid.about(RayScene(head.vertices, head.faces), np.zeros(len(head.faces), bool), np.zeros(3), -60.0)
+    return grid, TexelSurface(grid.mesh(np.full(grid.base.shape, SHELL_MM)), 128)
+
+
+def kinds_of(views, shown):
+    """{frame: [H, W, 3]}: what shown(places [N, 3]) says of the shell's places, 0 to 2; 0 of all beside it."""
+    ball = sphere(SHELL_MM, 5)
+    scene, found = RayScene(ball.vertices, ball.faces), {}
+    for f, pose in enumerate(views.camera_from_head):
+        face, _, depth = camera_hits(scene, pose, LENS, *SIZE)
+        picture, hit = np.zeros((*face.shape, 3), np.float32), face >= 0
+        places = (pixel_directions(LENS, *SIZE)[hit] * depth[hit][:, None] - pose[:3, 3]) @ pose[:3, :3]
+        picture[hit] = np.eye(3, dtype=np.float32)[shown(places)]
+        found[f] = picture
+    return found
+
+
+@pytest.fixture(scope="module")
+def views():
+    return Views.in_one_light(nods(np.linspace(-40.0, 40.0, 5)), LENS, SIZE, "head", None, None)
+
+
+def look(shell, views, shown):
+    grid, texels = shell
+    seen = look_for_hair(grid, texels, kinds_of(views, shown), views)
+    return seen, covered(grid, texels, seen)
+
+
+def test_hair_is_where_frames_show_it(shell, views):
+    seen, share = look(shell, views, lambda places: (places[:, 1] < HAIRLINE_MM).astype(int))
+    grid, texels = shell
+    vertices, alpha = texels.mesh.vertices, alpha_of(texels, seen, share)
+    front = vertices[:, 2] > 40.0
+    assert share[front & (vertices[:, 1] > HAIRLINE_MM + 6.0)].min() > 0.9
+    assert share[front & (vertices[:, 1] < HAIRLINE_MM - 6.0)].max() < 0.1
+    height = texels.interpolate(vertices)[:, 1]
+    facing = texels.interpolate(vertices)[:, 2] > 40.0
+    assert alpha[facing & (height > HAIRLINE_MM + 4.0)].min() > 0.95
+    assert alpha[facing & (height < HAIRLINE_MM - 4.0)].max() < 0.05
+
+
+def test_unseen_it_ends_where_it_does_beside(shell, views):
+    """The back, which no frame shows, has its border as high as the sides."""
+    _, share = look(shell, views, lambda places: (places[:, 1] < HAIRLINE_MM).astype(int))
+    vertices = shell[1].mesh.vertices
+    back = vertices[:, 2] < -75.0
+    assert share[back & (vertices[:, 1] > HAIRLINE_MM + 12.0)].min() > 0.6
+    assert share[back & (vertices[:, 1] < HAIRLINE_MM - 16.0)].max() < 0.4
+
+
+def test_what_hangs_on_nothing_is_no_hair(shell, views):
+    """A dark patch on the chin, apart from the hair of the scalp."""
+    def shown(places):
+        patch = np.linalg.norm(places - [0.0, -25.0, 84.0], axis=1) < 15.0
+        return np.where((places[:, 1] > HAIRLINE_MM) | patch, 0, 1)
+
+    seen, share = look(shell, views, shown)
+    vertices = shell[1].mesh.vertices
+    patch = np.linalg.norm(vertices - [0.0, -25.0, 84.0], axis=1) < 10.0
+    assert seen.hair.max() > 0.0 and share[patch].max() == 0.0
+
+
+def test_background_counts_only_where_it_is_faced(shell, views):
+    """Pictures of a smaller head: the rim of the shell shows background, its front does not."""
+    kinds = {f: picture * (np.hypot(*(np.indices(picture.shape[:2]) - 79.5)) < 36.0)[..., None]
+             for f, picture in kinds_of(views, lambda places: np.zeros(len(places), int)).items()}
+    grid, texels = shell
+    share = covered(grid, texels, look_for_hair(grid, texels, kinds, views))
+    assert share[texels.mesh.vertices[:, 1] > 40.0].min() > 0.9
