@@ -98,8 +98,8 @@ def find_hair(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray, vi
     if dome < LEAST_DOME:
         context.note(f"hair: it covers {dome:.0%} of the skull at most: no surface of its own")
         return None
-    # Where hair ends on the skin, beside forehead and cheeks, it lies on it.
-    bare = (share < 0.5) & (grid.centres[..., 1] > pixels.chin_mm)
+    # Where hair ends on the skull it grows there; lower down it hangs free.
+    bare = (share < 0.5) & (np.arange(len(share)) < grid.domed)[:, None]
     radius, said = hull_radius(grid, solids, views, bare)
     shell = TexelSurface(grid.mesh(radius), size)
     seen = look_for_hair(grid, shell, kinds, views)
