@@ -18,7 +18,7 @@ from pxr import Tf, UsdUtils
 from shared.errors import InputError, LimnError
 from shared.geometry.mesh_checks import mesh_errors, uv_overlap
 from shared.io.arrays import load_arrays
-from shared.io.export_maps import DISPLACEMENT, MAPS, map_errors, map_file, read_map
+from shared.io.export_maps import DISPLACEMENT, HAIR_MAPS, MAPS, map_errors, map_file, read_map
 from shared.io.exr_checks import header_errors, header_gaps
 from shared.io.exr_header import check_decodable
 from shared.io.gltf_validate import glb_errors
@@ -32,6 +32,7 @@ LARGEST_OVERLAP = 1e-3
 OVERLAP_TEXELS = 1024
 """Edge of the map on which overlap is measured."""
 AGAIN = "export again: python -m stages.export_usd --subject SUBJECT --force"
+HAIR_OBJ = "hair.obj"
 _LAYERS = ("head.usda", "head_payload.usda", "head_geo.usdc", "head_mtl.usda")
 _LIGHTS = ("envmap.exr", "envmap_far.exr", "envmaps/*.exr", "views/*_light.exr")
 _RIGID_TOLERANCE = 1e-6
@@ -74,9 +75,13 @@ def check_export(
     checks = _Checks(folder, set(spoilt), older)
     checks.headers()
     checks.of("mesh.obj", checks.mesh)
+    hairy = bool(checks.files(HAIR_OBJ, *(_map_path(folder, name) for name in HAIR_MAPS)))
+    if hairy:
+        checks.of(HAIR_OBJ, checks.hair)
     for name in MAPS:
         file = _map_path(folder, name)
-        if name != DISPLACEMENT or checks.files(file):  # the layers say whether there should be one
+        # the layers say whether there should be a displacement
+        if hairy if name in HAIR_MAPS else name != DISPLACEMENT or checks.files(file):
             checks.of(file, lambda file, name=name: checks.map(file, name))
     checks.map_sizes()
     checks.of("envmap.exr", checks.light)
@@ -172,10 +177,17 @@ class _Checks:
             self.fault(file, f"several faces cover {share:.2%} of the texels, about u {u:.2f}, v {v:.2f}",
                        "lay out the UVs anew: what faces share, all of them show", fatal=False)
 
+    def hair(self, file: str) -> list[str]:
+        """Indices, positions, UVs."""
+        mesh = read_obj(self.folder / file)
+        self.found.facts.append(f"hair of {len(mesh.faces)} faces")
+        return mesh_errors(mesh)
+
     def map(self, file: str, name: str) -> list[str]:
         """Shape and values of one map."""
         values = read_map(self.folder / file, name)
-        if name != DISPLACEMENT:  # it needs no more texels than the mesh has vertices for
+        # the displacement needs no more texels than the mesh has vertices for, hair has an atlas of its own
+        if name not in (DISPLACEMENT, *HAIR_MAPS):
             self.sizes[file] = values.shape[1], values.shape[0]
         return map_errors(name, values)
 

@@ -23,14 +23,18 @@ MAPS = {
     "material": ("materials", "0 to 1: probability of each material; Y: number of the likeliest"),
     "specular_ior": ("data", "index of refraction that shows the specular intensity, for UsdPreviewSurface"),
     "displacement": ("data", "mm along the normal of the subdivided base mesh"),
+    "hair_albedo": ("colour", "share of light scattered back, per channel"),
+    "hair_alpha": ("data", "0 to 1: how much of a place is hair"),
 }
 DISPLACEMENT = "displacement"
-SOLVED_MAPS = tuple(name for name in MAPS if name not in ("material", "specular_ior", DISPLACEMENT))
+HAIR_MAPS = HAIR_ALBEDO, HAIR_ALPHA = "hair_albedo", "hair_alpha"
+"""Of the surface of hair that stands off the head, where there is one; they have texture coordinates of their own."""
+SOLVED_MAPS = tuple(name for name in MAPS if name not in ("material", "specular_ior", DISPLACEMENT, *HAIR_MAPS))
 """Those that inverse_render solves; specular_ior follows from specular_intensity, displacement from the mesh, material
 from what texels look like."""
 LARGEST_HEIGHT_MM = 10.0
 """A displacement beyond it joins what are different parts of a head."""
-_UP_TO_ONE = ("diffuse_albedo", "confidence", "normal", "roughness", "material")
+_UP_TO_ONE = ("diffuse_albedo", "confidence", "normal", "roughness", "material", *HAIR_MAPS)
 UDIM_TILE = 1001
 WORKING_SPACE, ACESCG = "lin_rec709_scene", "lin_ap1_scene"
 

@@ -34,7 +34,7 @@ from shared.geometry.mesh_checks import mesh_errors, mesh_warnings
 from shared.geometry.transforms import project, world_from_head
 from shared.imaging.color import encode_srgb
 from shared.io.arrays import load_arrays, read_json
-from shared.io.export_maps import DISPLACEMENT, MAPS, acescg_from_rec709, paste_crop
+from shared.io.export_maps import DISPLACEMENT, HAIR_MAPS, MAPS, acescg_from_rec709, paste_crop
 from shared.io.images import read_exr, read_png, write_exr
 from shared.io.meshes import read_obj
 from shared.io.usd import VARIANT_SET, VARIANT_STILL, prim_name
@@ -90,7 +90,7 @@ def test_prim_name_is_valid_and_readable(name, expected):
 
 def test_every_file_of_the_contract_is_there(exported):
     files = {path.relative_to(exported["head"]).as_posix() for path in exported["head"].rglob("*") if path.is_file()}
-    maps = {f"maps/{name}.exr" for name in MAPS if name != DISPLACEMENT}
+    maps = {f"maps/{name}.exr" for name in MAPS if name not in (DISPLACEMENT, *HAIR_MAPS)}
     pictures = {f"renders/{frame:04d}.exr" for frame in RENDERED} | {f"plates/{frame:04d}.jpg" for frame in FRAMES}
     pictures |= {f"views/novel_{name}.exr" for name in NOVEL_VIEWS}
     pictures |= {f"views/relit_{name}{kind}.exr" for kind in ("", "_light") for name in STUDIO_LIGHTS}
@@ -459,7 +459,7 @@ def test_udim_names(work, tmp_path):
     export_usd.run(job)
     export_usd.check(job)
     assert {path.name for path in (job.out / "maps").iterdir()} == {
-        f"{name}.1001.exr" for name in MAPS if name != DISPLACEMENT}
+        f"{name}.1001.exr" for name in MAPS if name not in (DISPLACEMENT, *HAIR_MAPS)}
     stage = Usd.Stage.Open(str(job.out / "head.usda"))
     for name in ("preview_diffuse_albedo", "openpbr_diffuse_albedo"):
         assert shader(stage, name).GetInput("file").Get().path == "./maps/diffuse_albedo.1001.exr"

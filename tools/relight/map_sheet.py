@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from shared.io.export_maps import MAPS
+from shared.io.export_maps import HAIR_ALPHA, MAPS
 from shared.io.material_maps import label_picture
 from shared.report.pictures import grey_bytes, srgb_bytes, viridis_bytes
 
@@ -15,7 +15,7 @@ COLUMNS, TILE_PX, LABEL_PX = 4, 512, 28
 _INK, _GROUND = (230, 230, 230), 24
 _FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.5
 _COLOUR_MAPPED = ("confidence",)
-_FROM_0_TO_1 = ("confidence", "roughness")
+_FROM_0_TO_1 = ("confidence", "roughness", HAIR_ALPHA)
 
 
 def map_sheet(maps: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -104,7 +104,8 @@ def write_turntable(export: Path, settings: TurntableSettings, progress: Progres
 
 def _state_of(export: Path, settings: TurntableSettings) -> dict:
     """What the pictures depend on: the files that they show, and the settings."""
-    shown = [export / "mesh.obj", export / "poses.npz", *sorted((export / "maps").glob("*.exr"))]
+    shown = [export / "mesh.obj", export / "poses.npz", *export.glob("hair.obj"),
+             *sorted((export / "maps").glob("*.exr"))]
     if missing := [path for path in shown[:1] if not path.is_file()]:
         raise InputError("no export of a head", where=str(export), expected=missing[0].name)
     return {"export": {path.relative_to(export).as_posix(): hash_file(path) for path in shown}, **asdict(settings)}
