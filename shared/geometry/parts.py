@@ -11,8 +11,8 @@ from shared.geometry.eyeballs import SIDES, Eyeball
 from shared.geometry.mesh import Mesh, shading_normals
 from shared.geometry.quads import QuadMesh
 
-HEAD, EYES = "head", tuple(f"eye_{side}" for side in SIDES)
-"""Names of the parts; the eyes in the order of SIDES."""
+HEAD, EYES, HAIR = "head", tuple(f"eye_{side}" for side in SIDES), "hair"
+"""Names of the parts; the eyes in the order of SIDES; hair is a mesh beside the head's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +45,11 @@ def head_parts(
     whole = [(HEAD, np.nonzero(rest)[0], np.zeros(3))]
     whole += [(name, np.sort(eye.faces), eye.centre) for name, eye in zip(EYES if eyes else (), eyes, strict=True)]
     return tuple(_part(mesh, normals, *each) for each in whole)
+
+
+def hair_part(hair: Mesh) -> RigidPart:
+    """Hair that stands off the head, which goes with it as it is: all of its mesh, with its own normals."""
+    return RigidPart(HAIR, hair, shading_normals(hair), np.zeros(3), np.arange(len(hair.vertices)))
 
 
 def _part(mesh: Mesh, normals: np.ndarray, name: str, faces: np.ndarray, pivot: np.ndarray) -> RigidPart:

@@ -7,6 +7,9 @@ the format cannot say: a shifted principal point and an environment light; both 
 Eyeballs that are known are nodes of their own below the head's: their centre is the node's place, the gaze its
 rotation, and without the animation they look straight ahead.
 
+Hair that stands off the head is a node of its own below the head's, the same mesh in all sizes of the head. Its alpha
+is cut at a half: viewers draw that without faults, while blended they would have to sort its faces from the back.
+
 Facial actions are morph targets of places and normals, sparse, named in the mesh's extras as exporters agreed on. glTF
 goes straight from 0 to 1: an in-between is a target of its own after all others, the difference from that straight way.
 `eyeBlinkLeft_50` belongs to `eyeBlinkLeft`: with weight 1 - |2 w - 1| where that one has w. The animation has the
@@ -28,9 +31,9 @@ from scipy.spatial.transform import Rotation
 
 from shared.geometry.blend_shapes import BLINKS, BlendShape
 from shared.geometry.eyeballs import EYE_ROUGHNESS, TEAR_FILM_IOR
-from shared.geometry.mesh import tangent_frames, unique_pairs, uv_tangents
-from shared.geometry.parts import HEAD, RigidPart
-from shared.io.export_maps import integer_codes
+from shared.geometry.mesh import Mesh, tangent_frames, unique_pairs, uv_tangents
+from shared.geometry.parts import HAIR, HEAD, RigidPart, hair_part
+from shared.io.export_maps import HAIR_MAPS, integer_codes
 from shared.io.images import texture_png
 from shared.io.usd_capture import UsdCapture, eye_turns, world_from_head_rigid, world_from_usd_camera
 
@@ -40,10 +43,20 @@ _ARRAY, _INDEX = 34962, 34963
 _LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
 _FIRST_EYE = 2
 _SKIN, _EYE = 0, 1
+_HAIR_TEXTURE = 4
 _EYE_MATERIAL = {
     "name": "eye",
     "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": EYE_ROUGHNESS},
     "extensions": {"KHR_materials_ior": {"ior": TEAR_FILM_IOR}},
+}
+_HAIR_MATERIAL = {
+    "name": "hair",
+    "pbrMetallicRoughness": {"baseColorTexture": {"index": _HAIR_TEXTURE}, "metallicFactor": 0.0,
+                             "roughnessFactor": 0.5},
+    "alphaMode": "MASK",
+    "alphaCutoff": 0.5,
+    "doubleSided": True,
+    "extensions": {"KHR_materials_specular": {"specularFactor": 0.0}},
 }
 _KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
@@ -105,10 +118,11 @@ def write_glb(
     maps: Mapping[str, np.ndarray],
     capture: UsdCapture,
     actions: Sequence[BlendShape] = (),
+    hair: Mesh | None = None,
 ) -> None:
     """One file with all inside. parts: the head, then the eyeballs that are to be nodes of their own, as head_parts has
-    them; maps: diffuse_albedo, specular_intensity, roughness and normal, as exported; actions: blend shapes of the
-    whole mesh, which move no eyeball."""
+    them; maps: diffuse_albedo, specular_intensity, roughness and normal, as exported, with hair hair_albedo and
+    hair_alpha, too; actions: blend shapes of the whole mesh, which move no eyeball; hair: what stands off the head."""
     buffer = _Buffer()
     textures, skin = _material(buffer, maps)
     width, height = capture.width, capture.height
@@ -122,13 +136,21 @@ def write_glb(
     meshes = [{"name": HEAD, "primitives": [_primitive(buffer, head, _SKIN, targets)]}]
     if targets:
         meshes[0] |= {"weights": [0.0] * len(targets), "extras": {"targetNames": [shape.name for shape in targets]}}
+    meshes += [{"name": eye.name, "primitives": [_primitive(buffer, eye, _EYE)]} for eye in turning]
+    materials = [skin, _EYE_MATERIAL] if turning else [skin]
+    if hair is not None:
+        nodes[0].setdefault("children", []).append(len(nodes))
+        nodes.append({"name": HAIR, "mesh": len(meshes)})
+        meshes.append({"name": HAIR, "primitives": [_primitive(buffer, hair_part(hair), len(materials))]})
+        materials.append(_HAIR_MATERIAL)
+        textures.append(_hair_picture(buffer, maps))
     content = {
         "asset": {"version": "2.0", "generator": "Limn"},
         "scene": 0,
         "scenes": [{"name": name, "nodes": [0, 1]}],
         "nodes": nodes,
-        "meshes": meshes + [{"name": eye.name, "primitives": [_primitive(buffer, eye, _EYE)]} for eye in turning],
-        "materials": [skin, _EYE_MATERIAL] if turning else [skin],
+        "meshes": meshes,
+        "materials": materials,
         "extensionsUsed": ["KHR_materials_ior", "KHR_materials_specular"] if turning else ["KHR_materials_specular"],
         "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
         "images": [{"bufferView": view, "mimeType": "image/png"} for view in textures],
@@ -242,6 +264,12 @@ def _material(buffer: _Buffer, maps: Mapping[str, np.ndarray]) -> tuple[list[int
         "extensions": {"KHR_materials_specular": specular},
     }
     return [buffer.add(texture_png(picture)) for picture in pictures], material
+
+
+def _hair_picture(buffer: _Buffer, maps: Mapping[str, np.ndarray]) -> int:
+    """View of the picture with hair's colour and alpha."""
+    colour, alpha = (integer_codes(name, maps[name], 8) for name in HAIR_MAPS)
+    return buffer.add(texture_png(np.dstack([colour, alpha])))
 
 
 def _animation(buffer: _Buffer, capture: UsdCapture, eye_count: int, targets: Sequence[str]) -> dict:

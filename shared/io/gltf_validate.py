@@ -33,6 +33,7 @@ _SAMPLING = {"magFilter": (9728, 9729), "minFilter": (9728, 9729, 9984, 9985, 99
              "wrapT": _WRAPS}
 _TARGETS = (34962, 34963)
 _MAGIC = {"image/png": b"\x89PNG\r\n\x1a\n", "image/jpeg": b"\xff\xd8\xff"}
+_ALPHA_MODES = ("OPAQUE", "MASK", "BLEND")
 _UNIT_TOLERANCE = 1e-3
 _MISBUILT = (AttributeError, IndexError, KeyError, MemoryError, OverflowError, RecursionError, TypeError, ValueError)
 
@@ -255,6 +256,9 @@ class _Glb:
             for name, value in factors.items():
                 if not (np.isfinite(value).all() and np.min(value) >= 0.0 and np.max(value) <= 1.0):
                     yield f"{where}/{name}: {value}, expected 0 to 1"
+            mode, cutoff = material.get("alphaMode", "OPAQUE"), material.get("alphaCutoff", 0.5)
+            if mode not in _ALPHA_MODES or ("alphaCutoff" in material and mode != "MASK") or not cutoff >= 0.0:
+                yield f"{where}/alphaMode: {mode} with a cutoff of {cutoff}, which is none or not for it"
             if np.min(specular.get("specularColorFactor", 0.0)) < 0.0:
                 yield f"{where}/specularColorFactor: {specular['specularColorFactor']}, expected 0 or more"
             ior = extensions.get("KHR_materials_ior", {}).get("ior", 1.5)

@@ -7,7 +7,8 @@
       geo               SkelRoot where the head has facial actions (usd_actions)
       geo/head          Mesh in millimetres, UVs per face corner, normals per vertex
       geo/eye_right     Mesh about the eyeball's centre, which it turns about; geo/eye_left likewise
-      mtl/skin          Material: UsdPreviewSurface and OpenPBR; mtl/eye likewise
+      geo/hair          Mesh, seen from both sides, where hair stands off the head; `visibility` hides it
+      mtl/skin          Material: UsdPreviewSurface and OpenPBR; mtl/eye and mtl/hair likewise
       capture           camera, lights and the clip's card, in the variant "clip" of the variant set "capture"
 
     What a mesh is made of lies in the variants of the set "detail" (usd_detail), what light does to the skin in those
@@ -17,8 +18,9 @@ The variant "clip" (the default) replays the capture: the head's (or the camera'
 samples, the light at rest, the clip on a card of purpose guide. The variant "still" leaves the head alone at head
 space's origin, for use in another scene. There, and at the default time of "clip", the eyes look straight ahead.
 
-Where the clip's gaze is not known the eyes are part of geo/head, which then moves by itself, below a scope. Else geo
-does, an Xform, and carries head and eyes. Where there are facial actions it is geo that moves in any case.
+Where the clip's gaze is not known the eyes are part of geo/head. Without hair of its own that one then moves by itself,
+below a scope. Else geo does, an Xform, and carries head, eyes and hair. Where there are facial actions it is geo that
+moves in any case. Hair is the same mesh in all variants; no action moves it.
 
 References: USD Working Group, Guidelines for structuring USD assets; UsdGeomMesh, UsdGeomCamera,
 UsdLuxDomeLight, UsdGeomModelAPI.
@@ -39,7 +41,7 @@ from shared.errors import LimnError
 from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.eyeballs import Eyeball
 from shared.geometry.mesh import Mesh, shading_normals
-from shared.geometry.parts import EYES, HEAD, RigidPart, head_parts, quad_part
+from shared.geometry.parts import EYES, HAIR, HEAD, RigidPart, hair_part, head_parts, quad_part
 from shared.geometry.quads import QuadMesh
 from shared.geometry.reduction import ReducedMesh
 from shared.imaging.displacement import DisplacedBase
@@ -61,8 +63,11 @@ from shared.io.usd_detail import BASE, DETAIL_SET, FULL, define_details, each_de
 from shared.io.usd_material import (
     EYE,
     EYE_MAPS,
+    HAIR_INPUTS,
     LOOK_SET,
+    MATT,
     MEASURED,
+    SHADER_INPUTS,
     SKIN_LOOK,
     TextureFile,
     define_displacement,
@@ -88,10 +93,11 @@ class BaseHead:
 class HeadAsset:
     """Everything that goes into head.usda. Paths are relative to the layer.
 
-    maps: {name of usd_material.SHADER_INPUTS: texture}; envmap: the dome light's texture; lamp: what stands near of the
-    light and is not in that texture, or None; plate: the clip's frames, or None; eyes: the right and the left eyeball
-    of the mesh, to be meshes of their own, or none; actions: blend shapes of the mesh, which move no eyeball; details:
-    {level: the mesh with fewer faces}; base: the mesh as displaced quads, or None; levels: of detail to be written, the
+    maps: {name of usd_material.SHADER_INPUTS, with hair of HAIR_INPUTS, too: texture}; envmap: the dome light's
+    texture; lamp: what stands near of the light and is not in that texture, or None; plate: the clip's frames, or None;
+    eyes: the right and the left eyeball of the mesh, to be meshes of their own, or none; actions: blend shapes of the
+    mesh, which move no eyeball; details: {level: the mesh with fewer faces}; base: the mesh as displaced quads, or
+    None; hair: what stands off the head, a mesh with UVs of its own, or None; levels: of detail to be written, the
     first one chosen: FULL, names of details, BASE; metadata: nested dictionaries of strings, numbers and lists for the
     root prim's customData["limn"].
     """
@@ -107,9 +113,15 @@ class HeadAsset:
     actions: Sequence[BlendShape] = ()
     details: Mapping[str, ReducedMesh] = field(default_factory=dict)
     base: BaseHead | None = None
+    hair: Mesh | None = None
     levels: Sequence[str] = (FULL,)
     version: str = "1"
     metadata: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def geo_moves(self) -> bool:
+        """Is it geo that carries the motion, and not geo/head alone?"""
+        return bool(self.eyes or self.actions) or self.hair is not None
 
     def parts(self, level: str) -> tuple[RigidPart, ...]:
         """Head and eyes at FULL or one of the details: with the full mesh's normals at all of them, since few faces
@@ -189,7 +201,7 @@ def _layer_metadata(stage: Usd.Stage) -> None:
 
 def _define_geometry(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None:
     geo = root.AppendChild("geo")
-    kind = UsdSkel.Root if asset.actions else UsdGeom.Xform if asset.eyes else UsdGeom.Scope
+    kind = UsdSkel.Root if asset.actions else UsdGeom.Xform if asset.geo_moves else UsdGeom.Scope
     kind.Define(stage, geo)
     skeleton = define_skeleton(stage, geo, asset.actions) if asset.actions else None
     UsdGeom.Mesh.Define(stage, geo.AppendChild(HEAD))
@@ -198,6 +210,9 @@ def _define_geometry(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None
         prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*map(float, eye.centre)))
         # The variants give its value: one that stood here would be stronger than theirs in a single layer.
         prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
+    if asset.hair is not None:
+        hair = hair_part(asset.hair)
+        define_mesh(stage, str(geo.AppendChild(HAIR)), hair.mesh, hair.normals).CreateDoubleSidedAttr(True)
     for level in each_detail(stage.GetPrimAtPath(root), asset.levels):
         for part in asset.parts(FULL if level == BASE else level):
             path = geo.AppendChild(part.name)
@@ -222,7 +237,8 @@ def _define_base(stage: Usd.Stage, path: Sdf.Path, asset: HeadAsset, skeleton: S
 def _define_materials(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> None:
     """The materials and their bindings: a layer that can be muted or replaced without the geometry."""
     UsdGeom.Scope.Define(stage, root.AppendChild("mtl"))
-    material = define_material(stage, str(root.AppendPath("mtl/skin")), asset.maps)
+    skin = {name: asset.maps[name] for name in SHADER_INPUTS if name in asset.maps}
+    material = define_material(stage, str(root.AppendPath("mtl/skin")), skin)
     _bind(stage, root, HEAD, material)
     if BASE in asset.levels:
         with in_variant(stage.GetPrimAtPath(root), DETAIL_SET, BASE, asset.levels[0]):
@@ -234,6 +250,9 @@ def _define_materials(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> Non
         eye = define_material(stage, str(root.AppendPath("mtl/eye")), shared, EYE)
         for name in EYES:
             _bind(stage, root, name, eye)
+    if asset.hair is not None:
+        own = {name: asset.maps[name] for name in HAIR_INPUTS}
+        _bind(stage, root, HAIR, define_material(stage, str(root.AppendPath("mtl/hair")), own, MATT))
 
 
 def _bind(stage: Usd.Stage, root: Sdf.Path, name: str, material: UsdShade.Material) -> None:
@@ -269,7 +288,8 @@ def _define_interface(stage: Usd.Stage, root: Sdf.Path, asset: HeadAsset) -> Non
 
 def _define_variants(stage: Usd.Stage, root: Usd.Prim, asset: HeadAsset) -> None:
     define_variants(root, VARIANT_SET, (VARIANT_CLIP, VARIANT_STILL), VARIANT_CLIP)
-    vertices = asset.mesh.vertices
+    meshes = [asset.mesh] if asset.hair is None else [asset.mesh, asset.hair]
+    vertices = np.concatenate([mesh.vertices for mesh in meshes])
     UsdGeom.ModelAPI.Apply(root)
     with in_variant(root, VARIANT_SET, VARIANT_STILL, VARIANT_CLIP):
         _set_extents(root, vertices[None])
@@ -318,7 +338,7 @@ def _define_capture(stage: Usd.Stage, root: Usd.Prim, asset: HeadAsset) -> None:
     if asset.plate is not None:
         define_plate(stage, str(scope.AppendChild("plate")), capture, asset.plate)
     if capture.moves == "head":
-        moved = "geo" if asset.eyes or asset.actions else "geo/head"
+        moved = "geo" if asset.geo_moves else "geo/head"
         head = UsdGeom.Xformable(stage.GetPrimAtPath(root.GetPath().AppendPath(moved)))
         animate(head, world_from_head_rigid(capture), capture.frame_index)
 

@@ -1,4 +1,5 @@
-"""Skin and eyes as materials in USD: UsdPreviewSurface and MaterialX OpenPBR side by side, both fed by the same maps.
+"""Skin, eyes and hair as materials in USD: UsdPreviewSurface and MaterialX OpenPBR side by side, both fed by the same
+maps.
 
 Limn's BRDF is albedo / pi + specular_intensity * GGX with Schlick's F0 = 0.04 and alpha = roughness^2.
 OpenPBR takes that as it is: specular_ior 1.5 gives F0 = 0.04, specular_weight scales it, specular_roughness
@@ -17,6 +18,10 @@ its albedo, not how far light goes below it, so that comes from measurements of 
 Eyes share the map of the albedo; over it lies the tear film, one smooth dielectric. OpenPBR's coat would lay a second
 interface over that one.
 
+Hair that stands off the head has maps of its own and no highlights. Its alpha is the share of a place where hair is, so
+that the surface is not there for the rest of the light: UsdPreviewSurface's opacity mode `presence`, without a
+threshold.
+
 References: UsdPreviewSurface specification 2.6 (displacement: scene units along the normal); OpenPBR surface 1.1,
 section 3.6 (specular weight); MaterialX 1.39 (displacement).
 """
@@ -30,6 +35,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdShade
 
 from shared.geometry.eyeballs import EYE_ROUGHNESS, TEAR_FILM_IOR
+from shared.io.export_maps import HAIR_ALBEDO, HAIR_ALPHA
 
 LOOK_SET, MEASURED, SKIN_LOOK = "look", "measured", "skin"
 SKIN_MEAN_FREE_PATH_MM = (1.295, 0.952, 0.671)
@@ -50,11 +56,18 @@ SHADER_INPUTS = {
     "roughness": ("roughness", "specular_roughness"),
     "normal": ("normal", "geometry_normal"),
 }
+HAIR_INPUTS = {
+    HAIR_ALBEDO: ("diffuseColor", "base_color"),
+    HAIR_ALPHA: ("opacity", "geometry_opacity"),
+}
+"""The same for the maps of hair's own surface."""
+_ALL_INPUTS = SHADER_INPUTS | HAIR_INPUTS
 SRGB = "srgb_rec709_scene"
 _PREVIEW_TYPES = {
     "diffuseColor": (Sdf.ValueTypeNames.Color3f, "rgb"),
     "ior": (Sdf.ValueTypeNames.Float, "r"),
     "roughness": (Sdf.ValueTypeNames.Float, "r"),
+    "opacity": (Sdf.ValueTypeNames.Float, "r"),
     "normal": (Sdf.ValueTypeNames.Normal3f, "rgb"),
 }
 _IMAGE_NODES = {
@@ -63,6 +76,7 @@ _IMAGE_NODES = {
     "specular_roughness": ("ND_image_float", Sdf.ValueTypeNames.Float, 0.5),
     "geometry_normal": ("ND_image_vector3", Sdf.ValueTypeNames.Float3, Gf.Vec3f(0.5, 0.5, 1.0)),
     "displacement": ("ND_image_float", Sdf.ValueTypeNames.Float, 0.0),
+    "geometry_opacity": ("ND_image_float", Sdf.ValueTypeNames.Float, 1.0),
 }
 NORMAL_SCALE, NORMAL_BIAS = Gf.Vec4f(2.0, 2.0, 2.0, 1.0), Gf.Vec4f(-1.0, -1.0, -1.0, 0.0)
 """UsdUVTexture has to undo n * 0.5 + 0.5 by itself; the MaterialX normalmap node does it inside."""
@@ -83,13 +97,17 @@ class TextureFile:
 
 @dataclass(frozen=True)
 class Finish:
-    """What no map says of a surface: its index of refraction and its roughness, None: the shaders' own."""
+    """What no map says of a surface: its index of refraction, its roughness, None: the shaders' own, and whether it has
+    highlights."""
 
     ior: float = IOR
     roughness: float | None = None
+    shines: bool = True
 
 
 SKIN, EYE = Finish(), Finish(TEAR_FILM_IOR, EYE_ROUGHNESS)
+MATT = Finish(ior=1.0, roughness=0.5, shines=False)
+"""Hair: an index of 1 reflects nothing."""
 EYE_MAPS = ("diffuse_albedo",)
 """Those of SHADER_INPUTS that the eyes read: intensity, roughness and relief of the others are skin's."""
 
@@ -108,8 +126,8 @@ def modulated_ior(specular_intensity: np.ndarray) -> np.ndarray:
 def define_material(
     stage: Usd.Stage, path: str, maps: Mapping[str, TextureFile], finish: Finish = SKIN
 ) -> UsdShade.Material:
-    """Defines the material from maps {name of SHADER_INPUTS: texture}; for absent ones the finish or the input's
-    default counts."""
+    """Defines the material from maps {name of SHADER_INPUTS or HAIR_INPUTS: texture}; for absent ones the finish or
+    the input's default counts."""
     material = UsdShade.Material.Define(stage, path)
     _preview_surface(stage, material, maps, finish)
     _open_pbr(stage, material, maps, finish)
@@ -195,10 +213,13 @@ def _preview_surface(
     surface.CreateInput("ior", Sdf.ValueTypeNames.Float).Set(finish.ior)
     if finish.roughness is not None:
         surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(finish.roughness)
+    if HAIR_ALPHA in maps:
+        surface.CreateInput("opacityMode", Sdf.ValueTypeNames.Token).Set("presence")
+        surface.CreateInput("opacityThreshold", Sdf.ValueTypeNames.Float).Set(0.0)
     reader = _shader(stage, material, "preview_st", "UsdPrimvarReader_float2")
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
     coordinates = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
-    for name, (preview_input, _) in SHADER_INPUTS.items():
+    for name, (preview_input, _) in _ALL_INPUTS.items():
         if preview_input is None or name not in maps:
             continue
         texture = _preview_texture(stage, material, name, maps[name], coordinates)
@@ -219,11 +240,13 @@ def _open_pbr(
     surface.CreateInput("specular_ior", Sdf.ValueTypeNames.Float).Set(finish.ior)
     if finish.roughness is not None:
         surface.CreateInput("specular_roughness", Sdf.ValueTypeNames.Float).Set(finish.roughness)
+    if not finish.shines:
+        surface.CreateInput("specular_weight", Sdf.ValueTypeNames.Float).Set(0.0)
     surface.CreateInput("base_diffuse_roughness", Sdf.ValueTypeNames.Float).Set(0.0)
     reader = _shader(stage, material, "openpbr_st", "ND_geompropvalue_vector2")
     reader.CreateInput("geomprop", Sdf.ValueTypeNames.String).Set("st")
     coordinates = reader.CreateOutput("out", Sdf.ValueTypeNames.Float2)
-    for name, (_, open_pbr_input) in SHADER_INPUTS.items():
+    for name, (_, open_pbr_input) in _ALL_INPUTS.items():
         if open_pbr_input is None or name not in maps:
             continue
         value_type = _IMAGE_NODES[open_pbr_input][1]

@@ -96,8 +96,9 @@ def package_errors(path: Path | str) -> list[str]:
 
 
 def _shown_files(surface: UsdShade.Shader) -> list[str]:
-    """The textures of what every viewer shows: colour, roughness and normal. (Many ignore the index of refraction.)"""
-    inputs = [surface.GetInput(name) for name in ("diffuseColor", "roughness", "normal")]
+    """The textures of what every viewer shows: colour, opacity, roughness and normal. (Many ignore the index of
+    refraction.)"""
+    inputs = [surface.GetInput(name) for name in ("diffuseColor", "opacity", "roughness", "normal")]
     sources = [port.GetConnectedSources()[0] for port in inputs if port and port.HasConnectedSource()]
     return [UsdShade.Shader(found[0].source.GetPrim()).GetInput("file").Get().path for found in sources]
 

@@ -22,12 +22,12 @@ import numpy as np
 from pxr import UsdUtils
 
 from shared.errors import LimnError
-from shared.io.export_maps import MAPS, WORKING_SPACE, integer_codes
+from shared.io.export_maps import HAIR_MAPS, MAPS, WORKING_SPACE, integer_codes
 from shared.io.images import texture_png, write_exr
 from shared.io.usd import HeadAsset, write_single_layer
-from shared.io.usd_material import SHADER_INPUTS, SRGB, TextureFile
+from shared.io.usd_material import HAIR_INPUTS, SHADER_INPUTS, SRGB, TextureFile
 
-PNG_MAPS = ("diffuse_albedo", "roughness", "normal")
+PNG_MAPS = ("diffuse_albedo", "roughness", "normal", *HAIR_MAPS)
 _ALIGNMENT = 64
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _LOCAL_HEADER = 30
@@ -42,7 +42,7 @@ def write_head_usdz(
     with tempfile.TemporaryDirectory() as scratch:
         folder, textures = Path(scratch), {}
         (folder / "maps").mkdir()
-        for name in SHADER_INPUTS:
+        for name in (*SHADER_INPUTS, *(HAIR_INPUTS if asset.hair is not None else ())):
             is_colour = MAPS[name][0] == "colour"
             if name in PNG_MAPS:
                 textures[name] = TextureFile(f"./maps/{name}.png", SRGB if is_colour else "data")

@@ -12,8 +12,10 @@ from shapes import sphere, turned
 from shared.contract.job import Parameters
 from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface
+from shared.hair.hair_files import write_hair
+from shared.hair.joined import HairSurface
 from shared.imaging.material_labels import LABELS
-from shared.io.arrays import save_arrays, write_json
+from shared.io.arrays import read_json, save_arrays, write_json
 from shared.io.images import write_exr, write_png
 from shared.io.material_maps import write_material
 from shared.io.meshes import save_mesh
@@ -51,6 +53,22 @@ def toy_eyed_surface() -> Surface:
     return Surface(mesh, np.repeat([0, 1], [len(egg.faces), 2 * len(ball.faces)]).astype(np.uint8), SEGMENTS)
 
 
+def toy_hair() -> HairSurface:
+    """A cap over the egg's upper back, 14 mm off it: half of its map is there, with a soft edge."""
+    egg = toy_mesh()
+    kept = (egg.vertices[egg.faces].mean(1) @ [0.0, 1.0, -0.6]) > 20.0
+    used, corners = np.unique(egg.faces[kept], return_inverse=True)
+    places = egg.vertices[used] * (1.0 + 14.0 / np.linalg.norm(egg.vertices[used], axis=1, keepdims=True))
+    faces = corners.reshape(-1, 3).astype(np.int32)
+    random = np.random.default_rng(11)
+    albedo = random.uniform(0.02, 0.3, (MAP_SIZE, MAP_SIZE, 3)).astype(np.float32)
+    alpha = np.clip(np.linspace(-1.0, 2.0, MAP_SIZE), 0.0, 1.0).astype(np.float32)
+    return HairSurface(Mesh(places, faces, egg.uvs[used], faces), albedo, np.tile(alpha, (MAP_SIZE, 1)))
+
+
+HAIR_RECORD = {"thickness_mm": 14.0, "skull_covered": 0.6, "seen_share": 0.5, "lowest_mm": 80.0}
+
+
 def toy_gaze() -> np.ndarray:
     """[F, 2, 2]: both eyes wander by up to 0.5 radians and are shut in the third frame."""
     gaze = np.random.default_rng(8).uniform(-0.5, 0.5, (len(FRAMES), 2, 2))
@@ -85,9 +103,9 @@ def toy_material() -> np.ndarray:
     return (raised / raised.sum(2, keepdims=True)).astype(np.float32)
 
 
-def write_toy_work(work: Path, moves: str = "head", eyes: bool = False) -> Path:
-    """Writes work/<stage>/ of all stages before the export; eyes: of the mesh that has some, and their gaze. ->
-    work."""
+def write_toy_work(work: Path, moves: str = "head", eyes: bool = False, hair: bool = False) -> Path:
+    """Writes work/<stage>/ of all stages before the export; eyes: of the mesh that has some, and their gaze; hair: with
+    toy_hair. -> work."""
     for stage in STAGE.inputs:
         (work / stage).mkdir(parents=True)
         write_json(work / stage / "manifest.json", {"stage": stage, "version": 2, "parameters": {"size": 64}})
@@ -104,6 +122,10 @@ def write_toy_work(work: Path, moves: str = "head", eyes: bool = False) -> Path:
     _write_solution(work / "inverse_render")
     if eyes:
         _write_eyes(work / "inverse_render")
+    if hair:
+        solved = work / "inverse_render"
+        write_hair(solved, toy_hair())
+        write_json(solved / "solve.json", read_json(solved / "solve.json") | {"hair": HAIR_RECORD})
     return work
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdSkel, Vt
-from toy_result import FRAMES, INTRINSICS, SOURCE_SIZE, toy_eyed_surface, toy_gaze, toy_mesh, toy_poses
+from toy_result import FRAMES, INTRINSICS, SOURCE_SIZE, toy_eyed_surface, toy_gaze, toy_hair, toy_mesh, toy_poses
 
 from shared.geometry.blend_shapes import BlendShape, with_normals
 from shared.geometry.eyeballs import eyeballs_of
@@ -14,7 +14,7 @@ from shared.geometry.parts import head_parts
 from shared.io.usd import HeadAsset, write_head_usda, write_single_layer
 from shared.io.usd_actions import read_actions
 from shared.io.usd_capture import UsdCapture, world_from_head_rigid
-from shared.io.usd_material import SHADER_INPUTS, TextureFile
+from shared.io.usd_material import HAIR_INPUTS, SHADER_INPUTS, TextureFile
 from shared.io.usd_validate import usd_errors
 
 MAPS = {name: TextureFile(f"./maps/{name}.exr") for name in SHADER_INPUTS}
@@ -100,6 +100,25 @@ def test_the_head_at_rest_is_the_one_without_actions(opened, tmp_path):
     animation = UsdSkel.Animation(stage.GetDefaultPrim().GetPrimAtPath("geo/skeleton/actions"))
     assert not any(animation.GetBlendShapeWeightsAttr().Get())
     assert not without.GetDefaultPrim().GetPrimAtPath("geo/skeleton")
+
+
+def test_hair_below_the_skeleton_is_rigid(opened, tmp_path):
+    """A plain mesh that goes with the SkelRoot: no action moves it, and the validators take it."""
+    own = replace(opened[0], hair=toy_hair().mesh, maps=MAPS | {name: TextureFile(f"./maps/{name}.exr")
+                                                               for name in HAIR_INPUTS})
+    write_single_layer(tmp_path / "hair.usda", own)
+    faults = [error for error in usd_errors(tmp_path / "hair.usda") if "/maps/" not in error and "envmap" not in error]
+    assert faults == []
+    stage = Usd.Stage.Open(str(tmp_path / "hair.usda"))
+    hair = UsdGeom.Mesh(stage.GetDefaultPrim().GetPrimAtPath("geo/hair"))
+    rest = np.array(hair.GetPointsAttr().Get())
+    moved = baked(stage, jawOpen=1.0)
+    assert np.ptp(moved - np.array(head_of(opened[1]).GetPointsAttr().Get())) > 1.0
+    np.testing.assert_array_equal(hair.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()), rest)
+    expected = world_from_head_rigid(own.capture)
+    for f, frame in enumerate(FRAMES):
+        found = np.array(UsdGeom.Imageable(hair).ComputeLocalToWorldTransform(float(frame))).T
+        np.testing.assert_allclose(found, expected[f], atol=1e-9)
 
 
 @pytest.mark.parametrize("weight", [-0.6, 0.0, 0.25, 0.5, 0.8, 1.0, 1.4])
