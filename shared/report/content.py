@@ -16,7 +16,7 @@ from shared.geometry.eyeballs import Eyeball
 from shared.geometry.mesh import Mesh
 from shared.geometry.transforms import WORLD_FROM_CAMERA, invert_rigid
 from shared.io.arrays import read_json
-from shared.io.export_maps import SOLVED_MAPS
+from shared.io.export_maps import HAIR_MAPS, SOLVED_MAPS
 from shared.io.frames import FrameSet
 from shared.io.images import read_exr, read_png
 from shared.rendering.view_set import ViewCamera, ViewSet
@@ -76,7 +76,8 @@ class ReportContent:
     3D view shows it, with few faces; normals [V, 3] of its vertices.
     angles_deg [F, 3] yaw, pitch, roll and position_mm [F, 3] at frame_index [F]. excluded: (frame, stage, reason).
     views: None when they were not wished; relit_eyes: where its relit pictures show both eyes, as Frame.eyes. eyes,
-    actions: of the mesh, or none. selection: the models tried, one dictionary each, in order. residuals: nested
+    actions: of the mesh, or none; hair: what stands off the head, a mesh with the maps hair_albedo and hair_alpha, or
+    None. selection: the models tried, one dictionary each, in order. residuals: nested
     dictionaries of numbers. iterations: one dictionary of numbers each. warnings: (stage, text). parameters: (stage,
     name, value). clips: all but the first, where there are several. methods: paragraphs and references.
     """
@@ -96,6 +97,7 @@ class ReportContent:
     relit_eyes: tuple[int, int, int, int] | None = None
     eyes: Sequence[Eyeball] = ()
     actions: Sequence[BlendShape] = ()
+    hair: Mesh | None = None
     overlay: np.ndarray | None = None
     shape: np.ndarray | None = None
     chart: np.ndarray | None = None
@@ -133,7 +135,8 @@ class ReportInputs:
     folders {stage: folder} of the stages before it; mesh: the head with few faces, normals [V, 3]: those of its
     vertices in the whole one; record: the content of run.json; files: (name, text) pairs; views: None when they were
     not wished; clips: all but the first, where there are several; methods: paragraphs, references; eyes: the right and
-    the left eyeball of the whole mesh, where poses say how they look, or none; actions: its blend shapes.
+    the left eyeball of the whole mesh, where poses say how they look, or none; actions: its blend shapes; hair: what
+    stands off the head, a mesh, or None.
     """
 
     name: str
@@ -152,6 +155,7 @@ class ReportInputs:
     methods: tuple[Sequence[str], Sequence[str]] = ((), ())
     eyes: Sequence[Eyeball] = ()
     actions: Sequence[BlendShape] = ()
+    hair: Mesh | None = None
 
 
 def result_content(result: ReportInputs, frame_count: int) -> ReportContent:
@@ -165,17 +169,19 @@ def result_content(result: ReportInputs, frame_count: int) -> ReportContent:
     overlay, chart = tracked / "overlay.png", result.folders["sample_frames"] / "chart.png"
     shape = solved / "shape.png"
     excluded = excluded_frames(result.folders["sample_frames"], tracked)
+    hair_maps = () if result.hair is None else HAIR_MAPS
     return ReportContent(
         name=result.name,
         facts=_facts(frames, float(poses["intrinsics"][0, 0])),
         numbers=_numbers(angles, len(excluded), record),
         frames=compared_frames(frames, solved / "renders", chosen, held_out, again, _eyes_in(result, chosen)),
-        maps={name: result.maps[name] for name in (*SOLVED_MAPS, "material")},
+        maps={name: result.maps[name] for name in (*SOLVED_MAPS, "material", *hair_maps)},
         envmap=result.envmap,
         views=result.views,
         relit_eyes=_eyes_seen_by(result.views.relit_camera, result.eyes) if result.views and result.eyes else None,
         eyes=result.eyes,
         actions=result.actions,
+        hair=result.hair,
         mesh=result.mesh,
         normals=result.normals,
         frame_index=poses["frame_index"],

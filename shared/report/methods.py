@@ -167,6 +167,7 @@ def _solving(records: RunRecords) -> Iterable[str]:
         yield from _exposure(records.solve.get("exposure") or {})
         yield from _catchlights(records.solve.get("catchlights") or {})
     yield from _shape(parameters, records.solve.get("shape") or {})
+    yield from _hair(records.solve.get("hair") or {})
     residuals, held_out = records.solve.get("residuals", {}), records.solve.get("held_out_frames", ())
     if isinstance(residuals.get("held_out"), float) and isinstance(residuals.get("fitted"), float):
         yield (f"Re-renders differ from fitted frames by {residuals['fitted']:.4f} and from {_counted(len(held_out))} "
@@ -241,6 +242,14 @@ def _shape(parameters: Mapping[str, object], shape: Mapping[str, object]) -> Ite
         yield "The mesh was refined from shading, parallax and tracks in large smooth steps {Nicolet2021}."
     elif "refined" in shape:
         yield "A mesh refined from shading fitted held-out frames no better and was not used."
+
+
+def _hair(hair: Mapping[str, float]) -> Iterable[str]:
+    if hair:
+        yield ("Hair that stands off the head has a surface and an albedo of its own: the visual hull "
+               f"{{Laurentini1994}} of the person in all frames, {hair['thickness_mm']:.0f} mm (median) off the head. "
+               "How much of a place is hair was told from the frames' pixels by their colours, smoothed by a guided "
+               "filter {He2013}.")
 
 
 def _scale(records: RunRecords) -> Iterable[str]:

@@ -14,6 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from shared.geometry.mesh import shading_normals
+from shared.io.export_maps import HAIR_ALBEDO, HAIR_ALPHA
 from shared.io.material_maps import LABEL_WORDS, label_picture
 from shared.rendering.studio_lights import STUDIO_LIGHTS
 from shared.rendering.view_set import NOVEL_VIEWS, ViewSet
@@ -26,6 +28,7 @@ from shared.report.pictures import (
     error_bytes,
     grey_bytes,
     jpeg_uri,
+    over_chequers,
     shrunk,
     srgb_bytes,
     viridis_bytes,
@@ -46,6 +49,7 @@ _MAP_TEXTS = {
     "roughness": ("Roughness", "black 0 (mirror), white 1 (matt)"),
     "normal": ("Normal", "fine relief in tangent space; even blue is flat"),
     "confidence": ("Confidence", "how well the clip determines each texel; purple 0, yellow 1"),
+    "hair_albedo": ("Hair", "albedo of what stands off the head, in its own atlas; chequered where there is none"),
     "material": ("Material", "the likeliest: " + ", ".join(f"{name} {colour}" for name, colour in LABEL_WORDS.items())),
 }
 _CHART = (
@@ -84,7 +88,7 @@ def report_html(content: ReportContent) -> str:
         "error_range": ERROR_RANGE,
         "eyes": eyes,
         "relit_eyes": relit_eyes(content.views, content.relit_eyes),
-        "maps": [map_picture(name, np.asarray(values)) for name, values in content.maps.items()],
+        "maps": map_pictures(content.maps),
         "shape": _one(content.shape, SHEET_PIXELS, "the shape from three sides", _SHAPE),
         "views": view_pictures(content.views) if content.views else None,
         "turntable": [(f"../turntable/{file}", text) for file, text in TURNTABLE.items()],
@@ -153,6 +157,14 @@ def relit_eyes(views: ViewSet | None, rectangle: tuple[int, int, int, int] | Non
         return []
     return [Figure(jpeg_uri(close_up(picture, rectangle)), f"the eyes: {STUDIO_LIGHTS[name]}", name.replace("_", " "),
                    f": {STUDIO_LIGHTS[name]}") for name, picture in views.relit.items()]
+
+
+def map_pictures(maps: Mapping[str, np.ndarray]) -> list[Figure]:
+    """Each of the maps, {name: as for map_picture}; hair's colour as its alpha lets it be seen, both in one."""
+    shown = {name: values for name, values in maps.items() if name != HAIR_ALPHA}
+    if HAIR_ALPHA in maps:
+        shown[HAIR_ALBEDO] = over_chequers(maps[HAIR_ALBEDO], maps[HAIR_ALPHA])
+    return [map_picture(name, np.asarray(values)) for name, values in shown.items()]
 
 
 def map_picture(name: str, values: np.ndarray) -> Figure:
@@ -326,11 +338,16 @@ def flat(values: Mapping[str, object], prefix: str = "") -> list[tuple[str, obje
 
 def _viewer_data(content: ReportContent) -> dict:
     roughness, specular = content.maps.get("roughness"), content.maps.get("specular_intensity")
-    wet = np.zeros(len(content.mesh.vertices), bool)
+    wet, hair = np.zeros(len(content.mesh.vertices), bool), content.hair
     for eye in content.eyes:
         wet[eye.vertices] = True
     return {
         "mesh": packed(content.mesh, content.normals, wet, content.actions),
+        "hair": None if hair is None else {
+            "mesh": packed(hair, shading_normals(hair)),
+            "albedo": jpeg_uri(srgb_bytes(shrunk(content.maps[HAIR_ALBEDO], VIEWER_TEXTURE_PIXELS))),
+            "alpha": jpeg_uri(grey_bytes(shrunk(content.maps[HAIR_ALPHA], VIEWER_TEXTURE_PIXELS), 0.0, 1.0)),
+        },
         "wet": WET,
         "action_step": ACTION_STEP_MM,
         "albedo": jpeg_uri(srgb_bytes(shrunk(content.maps["diffuse_albedo"], VIEWER_TEXTURE_PIXELS))),

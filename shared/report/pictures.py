@@ -11,6 +11,8 @@ from shared.imaging.color import encode_srgb
 
 ERROR_RANGE = 0.05
 """The error map runs from -ERROR_RANGE to +ERROR_RANGE of linear radiance, clip maximum 1."""
+CHEQUERS, _BOARD = 32, (0.25, 0.4)
+"""Squares along an edge of what is seen through a map, and their radiances."""
 _DARKER, _BRIGHTER = np.float32([33, 102, 172]), np.float32([178, 24, 43])
 _EQUAL, _NOTHING = np.float32([247, 247, 247]), np.float32([200, 200, 200])
 
@@ -45,6 +47,13 @@ def error_bytes(clip: np.ndarray, render: np.ndarray, clipped: np.ndarray) -> np
     picture = _EQUAL + (colour - _EQUAL) * np.abs(amount)
     picture = np.where((render > 0.0).any(-1, keepdims=True), picture, _NOTHING)
     return (picture + 0.5).astype(np.uint8)
+
+
+def over_chequers(linear: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """[S, S, 3] linear, seen as far as alpha [S, S] says over a board of greys -> [S, S, 3] linear."""
+    square = np.arange(len(alpha)) * CHEQUERS // len(alpha)
+    board = np.where((square[:, None] + square) % 2, *_BOARD)
+    return (board + alpha * (np.moveaxis(linear, -1, 0) - board)).transpose(1, 2, 0)
 
 
 def shrunk(picture: np.ndarray, longest: int) -> np.ndarray:

@@ -63,6 +63,9 @@ REFERENCES = {
         "Halstead, Kass, DeRose, Efficient, Fair Interpolation using Catmull-Clark Surfaces. SIGGRAPH 1993.",
     "Harris2020": "Harris et al., Array programming with NumPy. Nature 585, 2020.",
     "He2010": "He, Sun, Tang, Guided Image Filtering. ECCV 2010.",
+    "He2013":
+        "He, Sun, Tang, Guided Image Filtering. IEEE Transactions on Pattern Analysis and Machine Intelligence 35 (6), "
+        "2013.",
     "He2015": "He, Sun, Fast Guided Filter. arXiv 1505.00996, 2015.",
     "Hoppe1999": "Hoppe, New Quadric Metric for Simplifying Meshes with Appearance Attributes. IEEE Visualization "
                  "1999.",
@@ -93,6 +96,9 @@ REFERENCES = {
     "Lange1989":
         "Lange, Little, Taylor, Robust Statistical Modeling Using the t Distribution. Journal of the American "
         "Statistical Association 84, 1989.",
+    "Laurentini1994":
+        "Laurentini, The Visual Hull Concept for Silhouette-Based Image Understanding. IEEE Transactions on Pattern "
+        "Analysis and Machine Intelligence 16 (2), 1994.",
     "Lepetit2009":
         "Lepetit, Moreno-Noguer, Fua, EPnP: An Accurate O(n) Solution to the PnP Problem. International Journal of "
         "Computer Vision 81, 2009.",

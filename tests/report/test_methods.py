@@ -68,6 +68,12 @@ def test_settings_change_the_text():
     assert "used poses that another tracker gave" in text
 
 
+def test_hair_is_told_of_where_it_stands_off():
+    hairy = flat(methods_text(records(solve=SOLVE | {"hair": {"thickness_mm": 16.4}})))
+    assert "16 mm (median) off the head" in hairy and "Visual Hull" in hairy
+    assert "visual hull" not in flat(methods_text(records())).lower()
+
+
 def test_numbered_images_are_not_decoded_as_video():
     images = {**FRAMES, "source": {**FRAMES["source"], "name": "%05d.png"}}
     found = records()

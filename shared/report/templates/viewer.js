@@ -1,5 +1,6 @@
 "use strict";
 // The 3D view: the head under the light of the clip (order-2 harmonics) and one lamp that can be moved.
+// Hair that stands off it is a second mesh with an alpha of its own.
 // Drag turns the head, or moves the lamp when that is chosen; wheel or pinch zooms. Facial actions: one at a time.
 function startViewer(canvas, data) {
   const gl = data && canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
@@ -23,11 +24,13 @@ function startViewer(canvas, data) {
   const fragmentSource = `
     precision highp float;
     varying vec3 n, p; varying vec2 st; varying float eye;
-    uniform sampler2D albedo; uniform vec3 harmonics[9], lamp; uniform float clip, power, plain;
+    uniform sampler2D albedo, alpha; uniform vec3 harmonics[9], lamp; uniform float clip, power, plain, least;
     uniform vec2 skin, wet;  // roughness and specular intensity
     vec3 toLinear(vec3 c) { return mix(c / 12.92, pow((c + 0.055) / 1.055, vec3(2.4)), step(0.04045, c)); }
     vec3 toCodes(vec3 c) { return mix(12.92 * c, 1.055 * pow(max(c, 1e-5), vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c)); }
     void main() {
+      float there = texture2D(alpha, st).r;
+      if (there < least) discard;
       vec3 N = normalize(gl_FrontFacing ? n : -n), V = normalize(vec3(0.0, 0.0, 3.2) - p), L = normalize(lamp);
       vec3 H = normalize(L + V), m = N;
       vec3 base = mix(toLinear(texture2D(albedo, st).rgb), vec3(0.5), plain);
@@ -40,7 +43,7 @@ function startViewer(canvas, data) {
       float f = 0.04 + 0.96 * pow(1.0 - max(dot(V, H), 0.0), 5.0), k = a / 2.0;
       float g = 1.0 / ((nl * (1.0 - k) + k) * (nv * (1.0 - k) + k));
       vec3 colour = base * max(sky, 0.0) * clip + (base + 3.14159 * finish.y * d * f * g / 4.0) * nl * power;
-      gl_FragColor = vec4(toCodes(clamp(colour, 0.0, 1.0)), 1.0);
+      gl_FragColor = vec4(toCodes(clamp(colour, 0.0, 1.0)), there);
     }`;
   const program = gl.createProgram();
   for (const [kind, source] of [[gl.VERTEX_SHADER, vertexSource], [gl.FRAGMENT_SHADER, fragmentSource]]) {
@@ -63,21 +66,54 @@ function startViewer(canvas, data) {
     gl.vertexAttribPointer(place, size, type, normalised, stride, 0);
     return buffer;
   }
-  const mesh = data.mesh, scale = 2 / Math.max(...mesh.size);
-  const positions = attribute("position", mesh.positions, 3, gl.UNSIGNED_SHORT, true, 8);
-  const normals = attribute("normal", mesh.normals, 4, gl.BYTE, true, 4);
-  attribute("uv", mesh.uvs, 2, gl.UNSIGNED_SHORT, true, 4);
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, bytes(mesh.faces), gl.STATIC_DRAW);
-  gl.uniform3fv(uniform("low"), mesh.low.map((x) => x * scale));
-  gl.uniform3fv(uniform("size"), mesh.size.map((x) => x * scale));
-  gl.uniform3fv(uniform("centre"), mesh.low.map((x, i) => (x + mesh.size[i] / 2) * scale));
+  const mesh = data.mesh, hair = data.hair;
+  function upload(own) {  // a mesh's buffers, bound together
+    const array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    const positions = attribute("position", own.positions, 3, gl.UNSIGNED_SHORT, true, 8);
+    const normals = attribute("normal", own.normals, 4, gl.BYTE, true, 4);
+    attribute("uv", own.uvs, 2, gl.UNSIGNED_SHORT, true, 4);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, bytes(own.faces), gl.STATIC_DRAW);
+    return { array, positions, normals, mesh: own };
+  }
+  const strands = hair && upload(hair.mesh), head = upload(mesh);
+  const all = hair ? [mesh, hair.mesh] : [mesh];
+  const low = mesh.low.map((_, i) => Math.min(...all.map((own) => own.low[i])));
+  const size = low.map((x, i) => Math.max(...all.map((own) => own.low[i] + own.size[i])) - x);
+  const scale = 2 / Math.max(...size);
+  gl.uniform3fv(uniform("centre"), low.map((x, i) => (x + size[i] / 2) * scale));
   gl.uniform3fv(uniform("harmonics"), data.harmonics.flat());
-  gl.uniform2f(uniform("skin"), data.roughness, data.specular);
   gl.uniform2fv(uniform("wet"), data.wet);
+  gl.uniform1i(uniform("albedo"), 0);
+  gl.uniform1i(uniform("alpha"), 1);
   gl.enable(gl.DEPTH_TEST);
+  const solid = gl.createTexture();  // a head's alpha
+  gl.bindTexture(gl.TEXTURE_2D, solid);
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, 1, 1, 0, gl.RGB, gl.UNSIGNED_BYTE, new Uint8Array([255, 255, 255]));
+  gl.generateMipmap(gl.TEXTURE_2D);
 
   const state = { yaw: 0.35, pitch: 0.05, lampYaw: -0.9, lampPitch: 0.5, zoom: 0.95, ready: false };
+  function drawPart(part, albedo, alpha, roughness, specular) {
+    gl.bindVertexArray(part.array);
+    for (const [k, texture] of [albedo, alpha].entries()) {
+      gl.activeTexture(gl.TEXTURE0 + k);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+    }
+    gl.uniform3fv(uniform("low"), part.mesh.low.map((x) => x * scale));
+    gl.uniform3fv(uniform("size"), part.mesh.size.map((x) => x * scale));
+    gl.uniform2f(uniform("skin"), roughness, specular);
+    gl.drawElements(gl.TRIANGLES, part.mesh.count, gl.UNSIGNED_INT, 0);
+  }
+  function drawHair() {  // its alpha as the share of a pixel's samples, whatever the order; without samples cut at a half
+    const samples = gl.getParameter(gl.SAMPLES) > 1;
+    gl.uniform1f(uniform("least"), samples ? 0.05 : 0.5);
+    if (samples) gl.enable(gl.SAMPLE_ALPHA_TO_COVERAGE);
+    gl.colorMask(true, true, true, false);  // the page must not shine through
+    drawPart(strands, textures.hair, textures.alpha, 0.5, 0);
+    gl.colorMask(true, true, true, true);
+    gl.disable(gl.SAMPLE_ALPHA_TO_COVERAGE);
+  }
   const control = (id) => document.getElementById(id);
   const rotation = (yaw, pitch) => {  // column-major: first about y, then about x
     const [c, s, d, t] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
@@ -99,7 +135,9 @@ function startViewer(canvas, data) {
     gl.uniform1f(uniform("clip"), +control("viewer-clip").value);
     gl.uniform1f(uniform("power"), +control("viewer-lamp").value);
     gl.uniform1f(uniform("plain"), control("viewer-plain").checked ? 1 : 0);
-    gl.drawElements(gl.TRIANGLES, mesh.count, gl.UNSIGNED_INT, 0);
+    gl.uniform1f(uniform("least"), 0);
+    drawPart(head, textures.head, solid, data.roughness, data.specular);
+    if (hair && (control("viewer-hair")?.checked ?? true)) drawHair();
     canvas.dataset.drawn = "yes";
   }
   const update = (buffer, values) => {
@@ -141,23 +179,27 @@ function startViewer(canvas, data) {
       const length = Math.hypot(...turned) || 1;
       turned.forEach((x, i) => { n[4 * k + i] = Math.round(127 * x / length); });
     }
-    update(positions, q);
-    update(normals, n);
+    update(head.positions, q);
+    update(head.normals, n);
     canvas.dataset.action = action.name + " " + w;
     draw();
   }
   for (const id of ["viewer-action", "viewer-weight"]) control(id)?.addEventListener("input", act);
-  const image = new Image();
-  image.onload = () => {
-    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.pixelStorei(gl.UNPACK_FLIP_Y_WEBGL, true);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, gl.RGB, gl.UNSIGNED_BYTE, image);
-    gl.generateMipmap(gl.TEXTURE_2D);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
-    state.ready = true;
-    draw();
-  };
-  image.src = data.albedo;
+  const pictures = { head: data.albedo, ...(hair ? { hair: hair.albedo, alpha: hair.alpha } : {}) }, textures = {};
+  for (const [name, source] of Object.entries(pictures)) {
+    const image = new Image();
+    image.onload = () => {
+      textures[name] = gl.createTexture();
+      gl.bindTexture(gl.TEXTURE_2D, textures[name]);
+      gl.pixelStorei(gl.UNPACK_FLIP_Y_WEBGL, true);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, gl.RGB, gl.UNSIGNED_BYTE, image);
+      gl.generateMipmap(gl.TEXTURE_2D);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+      state.ready = Object.keys(textures).length === Object.keys(pictures).length;
+      draw();
+    };
+    image.src = source;
+  }
   const limit = (x, reach) => Math.max(-reach, Math.min(reach, x));
   const pointers = new Map();
   canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); pointers.set(e.pointerId, e); });
@@ -184,7 +226,9 @@ function startViewer(canvas, data) {
   });
   const zoomBy = (factor) => { state.zoom = Math.max(0.5, Math.min(6, state.zoom * factor)); draw(); };
   canvas.addEventListener("wheel", (e) => { e.preventDefault(); zoomBy(Math.exp(-e.deltaY / 500)); }, { passive: false });
-  for (const id of ["viewer-clip", "viewer-lamp", "viewer-plain"]) control(id).addEventListener("input", draw);
+  for (const id of ["viewer-clip", "viewer-lamp", "viewer-plain", "viewer-hair"]) {
+    control(id)?.addEventListener("input", draw);
+  }
   window.addEventListener("resize", draw);
   draw();
 }
