@@ -1,11 +1,11 @@
 """The result as files that other programs open, and a page on which a person judges it.
 
 Reads    sample_frames: frames.json and the frames (for the plates and the report). track_landmarks: tracking.json
-         and overlay.png. init_albedo: its record. inverse_render: maps, envmap.exr, mesh.npz, poses.npz, renders,
-         solve.json. Of all of them manifest.json and provenance.json. Of several clips the first is exported, and the
-         light of each.
-Writes   head.usda with its payload, head.usdz, head.glb, mesh.obj, maps/*.exr, envmap.exr, envmaps/*.exr, poses.npz,
-         plates/*.jpg, renders/*.exr, views/*.exr, run.json, methods.txt, report.html.
+         and overlay.png. init_albedo: its record. inverse_render: maps, envmap.exr, mesh.npz, hair.npz, poses.npz,
+         renders, solve.json. Of all of them manifest.json and provenance.json. Of several clips the first is exported,
+         and the light of each.
+Writes   head.usda with its payload, head.usdz, head.glb, mesh.obj, hair.obj, maps/*.exr, envmap.exr, envmaps/*.exr,
+         poses.npz, plates/*.jpg, renders/*.exr, views/*.exr, run.json, methods.txt, report.html.
 Method   The head model's facial actions are carried over to the solved head, where the mesh is the model's, and written
          as blend shapes. Edges of the full mesh are collapsed to meshes of fewer faces; the head model's quads are laid
          under it as a subdivision surface, and what it has beyond that becomes a displacement map. Units, axes, colour
@@ -27,7 +27,7 @@ from shared.errors import LimnError
 
 STAGE = Stage(
     name="export_usd",
-    version=16,
+    version=17,
     help="The head as USD, glTF, OBJ and EXR, with a report to judge it by.",
     inputs=("sample_frames", "track_landmarks", "init_albedo", "inverse_render"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -43,6 +43,8 @@ STAGE = Stage(
         Output("head.glb", "the same as binary glTF: mesh, morph targets, textures, lens, motion; absent when glb is "
                "off", unit="m", optional=True),
         Output("mesh.obj", "the mesh with its UVs; groups for head and eyes", unit="mm", space="head"),
+        Output("hair.obj", "hair that stands off the head, with UVs of maps/hair_*.exr; absent where hair has no "
+               "surface of its own", unit="mm", space="head", optional=True),
         Output("maps/*.exr", "texture maps, v up", space="uv", colour_space="in each file"),
         Output("maps/png/*.png", "integer copies of the maps; absent unless png_copies", space="uv", optional=True),
         Output("envmap.exr", "the light, lat-long", space="world", colour_space="in the file"),
@@ -163,13 +165,13 @@ def find_base(job: Job, surface, writer):
 
 def write_images(job: Job, writer, maps: dict, envmap, frames, render_frames: list[int]) -> None:
     """maps/, envmap.exr and renders/ in the chosen precision and colour space."""
-    from shared.io.export_maps import SOLVED_MAPS, paste_crop, write_png_copies
+    from shared.io.export_maps import HAIR_MAPS, SOLVED_MAPS, paste_crop, write_png_copies
     from shared.io.images import read_exr
 
     writer.write_maps(job.out / "maps", maps)
     writer.write_colour(job.out / "envmap.exr", envmap, "radiance, clip maximum 1", latlong=True)
     if job.params.png_copies != "none":
-        solved = {name: maps[name] for name in SOLVED_MAPS}
+        solved = {name: maps[name] for name in (*SOLVED_MAPS, *HAIR_MAPS) if name in maps}
         write_png_copies(job.out / "maps" / "png", solved, int(job.params.png_copies))
     (job.out / "renders").mkdir()
     for frame_index in job.progress(render_frames, "renders"):
@@ -209,21 +211,23 @@ def near_lamp(solve: dict):
     return BallLamp(tuple(lamp["position_mm"]), lamp["radius_mm"], tuple(lamp["radiance"]))
 
 
-def describe_asset(job: Job, mesh, eyes, actions, details, base, capture, frames, writer, lamp):
+def describe_asset(job: Job, mesh, eyes, actions, details, base, hair, capture, frames, writer, lamp):
     """The asset that head.usda holds; writes the plates. actions: its blend shapes; details: {level: the mesh with
-    fewer faces}; base: the mesh as displaced quads, or None; lamp: what stands near of the light, or None."""
+    fewer faces}; base: the mesh as displaced quads, or None; hair: what stands off the head, a mesh, or None; lamp:
+    what stands near of the light, or None."""
     from shared.io.plates import crop_rectangle, write_plates
     from shared.io.usd import HeadAsset
     from shared.io.usd_capture import Plate
     from shared.io.usd_detail import BASE, FULL
-    from shared.io.usd_material import SHADER_INPUTS, TextureFile
+    from shared.io.usd_material import HAIR_INPUTS, SHADER_INPUTS, TextureFile
 
     plate = None
     if job.params.plates:
         shown = write_plates(job.out / "plates", frames, capture.frame_index, job.progress)
         plate = Plate({frame: f"./plates/{name}" for frame, name in shown.items()}, crop_rectangle(frames))
-    spaces = {"diffuse_albedo": writer.colour_space}
-    maps = {name: TextureFile(f"./maps/{writer.file_name(name)}", spaces.get(name, "data")) for name in SHADER_INPUTS}
+    spaces = {"diffuse_albedo": writer.colour_space, "hair_albedo": writer.colour_space}
+    read = (*SHADER_INPUTS, *(() if hair is None else HAIR_INPUTS))
+    maps = {name: TextureFile(f"./maps/{writer.file_name(name)}", spaces.get(name, "data")) for name in read}
     metadata = {
         "clip": {"name": frames.source_name, "width": capture.width, "height": capture.height, "fps": frames.fps},
         "moves": frames.moves,
@@ -234,13 +238,13 @@ def describe_asset(job: Job, mesh, eyes, actions, details, base, capture, frames
     }
     light = TextureFile("./envmap.exr" if lamp is None else "./envmap_far.exr", writer.colour_space)
     levels = (FULL, *details, *([BASE] if base else ())) if job.params.detail else (FULL,)
-    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, lamp, eyes, actions, details, base, levels,
-                     version=str(STAGE.version), metadata=metadata)
+    return HeadAsset(job.subject.name, mesh, maps, light, capture, plate, lamp, eyes, actions, details, base, hair,
+                     levels, version=str(STAGE.version), metadata=metadata)
 
 
 def write_assets(job: Job, asset, eyeballs, poses: dict, maps: dict, envmap) -> None:
-    """mesh.obj, poses.npz, head.usda and its layers; when wished, head.usdz and head.glb, with as many faces as
-    viewer_detail says. eyeballs: the groups of mesh.obj beside the head's; envmap [H, 2 H, 3]: what the asset's dome
+    """mesh.obj, hair.obj, poses.npz, head.usda and its layers; when wished, head.usdz and head.glb, with as many faces
+    as viewer_detail says. eyeballs: the groups of mesh.obj beside the head's; envmap [H, 2 H, 3]: what the asset's dome
     shows, linear Rec.709."""
     from shared.io.arrays import save_arrays
     from shared.io.gltf import write_glb
@@ -250,6 +254,8 @@ def write_assets(job: Job, asset, eyeballs, poses: dict, maps: dict, envmap) -> 
     from shared.io.usdz import write_head_usdz
 
     write_obj(job.out / "mesh.obj", asset.mesh, eyeballs)
+    if asset.hair is not None:
+        write_obj(job.out / "hair.obj", asset.hair)
     kept = ("camera_from_head", "frame_index", "intrinsics", "gaze", "eye_turn", "lids", "gain")
     save_arrays(job.out / "poses.npz", **{name: poses[name] for name in kept if name in poses})
     write_head_usda(job.out, asset)
@@ -259,7 +265,8 @@ def write_assets(job: Job, asset, eyeballs, poses: dict, maps: dict, envmap) -> 
         coarser = levels[levels.index(finest):] if job.params.detail else (finest,)
         write_head_usdz(job.out / "head.usdz", asset, coarser, maps, envmap)
     if job.params.glb:
-        write_glb(job.out / "head.glb", asset.name, asset.parts(finest), maps, asset.capture, asset.actions)
+        write_glb(job.out / "head.glb", asset.name, asset.parts(finest), maps, asset.capture, asset.actions,
+                  asset.hair)
 
 
 def light_moves(job: Job, moves: str) -> str:
@@ -267,8 +274,10 @@ def light_moves(job: Job, moves: str) -> str:
     return "head" if job.manifest("inverse_render")["parameters"].get("light_model") == "camera" else moves
 
 
-def render_views(job: Job, writer, mesh, eyes, actions, maps: dict, envmap, poses: dict, frames, solve: dict):
-    """Writes views/novel_*.exr, views/relit_*.exr and the lights -> the ViewSet; None when switched off."""
+def render_views(job: Job, writer, mesh, maps: dict, eyes, actions, envmap, poses: dict, frames, solve: dict):
+    """Writes views/novel_*.exr, views/relit_*.exr and the lights -> the ViewSet; None when switched off. mesh, maps:
+    the head's, joined with those of its hair where that stands off it; eyes, actions: of the head, whose vertices and
+    faces come first."""
     from shared.geometry.blend_shapes import LidActions
     from shared.imaging.turning_eyes import TurningEyes
     from shared.rendering.near_lamp import NearLamp
@@ -336,7 +345,7 @@ def run_record(job: Job, mesh, actions: dict, solve: dict, own_seconds: float) -
         own["warnings"].append(text)
         warnings.append((STAGE.name, text))
     records[STAGE.name] = own
-    kept = ("model", "residuals", "lamp", "albedo_scale", "held_out_frames", "clips")
+    kept = ("model", "residuals", "lamp", "hair", "albedo_scale", "held_out_frames", "clips")
     chosen = {key: solve[key] for key in kept if key in solve}
     chosen |= head_scale_record(job, solve) | ({"actions": actions} if actions else {})
     if selection := selection_record(job.input("inverse_render"), solve):
@@ -384,8 +393,10 @@ def run(job: Job) -> None:
     from shared.geometry.eyeballs import eyeballs_of
     from shared.geometry.mesh import shading_normals
     from shared.geometry.reduction import reduced
+    from shared.hair.hair_files import read_hair
+    from shared.hair.joined import joined_maps, joined_mesh
     from shared.io.arrays import read_json, write_json
-    from shared.io.export_maps import MapWriter
+    from shared.io.export_maps import HAIR_MAPS, MapWriter
     from shared.io.frames import FrameSet
     from shared.io.images import read_exr
     from shared.io.meshes import load_mesh
@@ -399,6 +410,10 @@ def run(job: Job) -> None:
     frames = FrameSet.open(job.input("sample_frames"))
     mesh, poses = load_mesh(solved / "mesh.npz"), read_poses(job)
     solve, maps, envmap = read_json(solved / "solve.json"), read_maps(solved / "maps"), read_exr(solved / "envmap.exr")
+    hair = read_hair(solved)
+    strands = None if hair is None else hair.mesh
+    if hair is not None:
+        maps |= dict(zip(HAIR_MAPS, (hair.albedo, hair.alpha), strict=True))
     source = {"stage": STAGE.name, "stage_version": STAGE.version, "source": "inverse_render"}
     params = job.params
     writer = MapWriter(params.map_format == "half", params.acescg, source, params.map_layout, params.udim)
@@ -417,9 +432,10 @@ def run(job: Job) -> None:
     (actions, said_of_them), few, base = share_out(len(work), lambda k: work[k]())
     details = dict(zip(REDUCED_FACES, few, strict=True))
     capture = describe_capture(job, poses, frames, actions)
-    asset = describe_asset(job, mesh, eyes, actions, details, base, capture, frames, writer, lamp)
+    asset = describe_asset(job, mesh, eyes, actions, details, base, strands, capture, frames, writer, lamp)
     write_assets(job, asset, eyeballs, poses, maps, far)
-    views = render_views(job, writer, mesh, eyes, actions, maps, envmap, poses, frames, solve)
+    seen = (mesh, maps) if hair is None else (joined_mesh(mesh, hair.mesh), joined_maps(maps, hair))
+    views = render_views(job, writer, *seen, eyes, actions, envmap, poses, frames, solve)
     record = run_record(job, mesh, said_of_them, solve, time.perf_counter() - start)
     write_json(job.out / "run.json", record)
     methods = method_records(job, record, solve)
@@ -427,7 +443,8 @@ def run(job: Job) -> None:
     folders = {name: job.input(name) for name in STAGE.inputs}
     files = [(output.path, output.help) for output in STAGE.outputs]
     result = ReportInputs(job.subject.name, folders, frames, details[PAGE_DETAIL].mesh, shading_normals(mesh), poses,
-                          maps, envmap, solve, record, files, views, clips, methods_paragraphs(methods), eyes, actions)
+                          maps, envmap, solve, record, files, views, clips, methods_paragraphs(methods), eyes, actions,
+                          strands)
     page = report_html(result_content(result, job.params.report_frames))
     (job.out / "report.html").write_text(page, encoding="utf-8")
 

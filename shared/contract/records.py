@@ -218,6 +218,14 @@ _MODEL = (
     Field("model.roughness_variation.held_out.one", "With one value."),
     Field("model.roughness_variation.held_out.local", "With local roughness."),
 )
+_HAIR = (
+    Field("hair", "Hair that stands off the head and has a surface of its own; absent where the head's own surface "
+          "meets the outline.", "", optional=True),
+    Field("hair.thickness_mm", "Median distance from the head, where outlines tell it.", unit="mm"),
+    Field("hair.skull_covered", "Share of the skull that it covers."),
+    Field("hair.seen_share", "Share of its map that some frame looks at."),
+    Field("hair.lowest_mm", "Its lower end over the chin; negative below it.", unit="mm"),
+)
 _LAMP = (
     Field("lamp", "How far the light's main lamp stands; absent where no lamp is in the light, it was said to be "
           "far, or there are several clips.", "", optional=True),
@@ -320,12 +328,7 @@ SOLVE = (
           unit="deg", optional=True),
     Field("poses.turned_deg", "How far they turned in all, rms.", unit="deg", optional=True),
     *_LAMP,
-    Field("hair", "Hair that stands off the head and has a surface of its own; absent where the head's own surface "
-          "meets the outline.", "", optional=True),
-    Field("hair.thickness_mm", "Median distance from the head, where outlines tell it.", unit="mm"),
-    Field("hair.skull_covered", "Share of the skull that it covers."),
-    Field("hair.seen_share", "Share of its map that some frame looks at."),
-    Field("hair.lowest_mm", "Its lower end over the chin; negative below it.", unit="mm"),
+    *_HAIR,
     Field("catchlights", "The brightest spots on the irises beside those of the solved light; absent where no open eye "
           "is seen.", "", optional=True),
     Field("catchlights.irises", "Irises that were looked at: of both eyes, in so many frames.", "int"),
@@ -408,6 +411,7 @@ RUN = (
     *_MODEL,
     Field("residuals.**", "As in solve.json.", ""),
     *_LAMP,
+    *_HAIR,
     *_SCALE,
     *(replace(field, path=f"head_{field.path}", optional=True) for field in _HEAD_SCALE),
     Field("held_out_frames", "Frames of the (first) clip that were not fitted.", "int", "H"),

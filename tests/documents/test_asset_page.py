@@ -16,8 +16,8 @@ PAGE = (DOCS / "asset.md").read_text(encoding="utf-8")
 
 @pytest.fixture(scope="module")
 def export(tmp_path_factory):
-    """With eyes, plates and a near lamp: every prim that there can be."""
-    return write_toy_export(tmp_path_factory.mktemp("asset"), lamp=True)
+    """With eyes, hair, plates and a near lamp: every prim that there can be."""
+    return write_toy_export(tmp_path_factory.mktemp("asset"), lamp=True, hair=True)
 
 
 @pytest.fixture(scope="module")
@@ -46,9 +46,9 @@ def code(cell):
 def shader_rows():
     """{path below the default prim: (id, file that it reads or none)}"""
     found = {}
-    for name, shader_id, reads, eye in rows("Shaders"):
+    for name, shader_id, reads, materials in rows("Shaders"):
         file = [path for path in code(reads) if path.startswith("maps/")]
-        for material in ("skin", "eye") if eye == "yes" else ("skin",):
+        for material in materials.split(", "):
             found[f"mtl/{material}/{code(name)[0]}"] = shader_id, file[0] if file else None
     return found
 
@@ -104,6 +104,12 @@ def test_constants_of_the_materials_are_those_of_the_page(prims):
     connected = {port.GetBaseName() for port in skin.GetInputs() if port.HasConnectedSource()}
     assert connected == {"base_color", "specular_weight", "specular_roughness", "geometry_normal"}
     assert all(f"`{name}`" in section("The BRDF in other words") for name in connected)
+    preview, openpbr = (UsdShade.Shader(prims[f"mtl/hair/{name}_surface"]) for name in ("preview", "openpbr"))
+    words = dict(row[:2] for row in rows("Hair"))
+    for surface, cell in ((preview, words["UsdPreviewSurface"]), (openpbr, words["OpenPBR"])):
+        for name, value in re.findall(r"`(\w+)` (\w+)", cell):
+            if name != "opacity":
+                assert str(surface.GetInput(name).Get()) in (value, f"{value}.0")
 
 
 def test_every_name_in_the_glb_is_on_the_page(export):

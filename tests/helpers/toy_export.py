@@ -26,10 +26,10 @@ def unfolded(surface: Surface) -> Surface:
 LAMP = {"near": True, "position_mm": [-500.0, 160.0, 300.0], "radius_mm": 35.0, "radiance": [8.0, 4.0, 2.0]}
 
 
-def write_toy_export(base: Path, lamp: bool = False, **parameters) -> Path:
+def write_toy_export(base: Path, lamp: bool = False, hair: bool = False, **parameters) -> Path:
     """Exports the head with two eyes into base/export -> that folder, with manifest.json and SHA256SUMS. lamp: one
-    stands near."""
-    work = write_toy_work(base / "work", eyes=True)
+    stands near; hair: some stands off the head."""
+    work = write_toy_work(base / "work", eyes=True, hair=hair)
     surface = unfolded(toy_eyed_surface())
     arrays = {"face_segment": surface.face_segment}
     save_mesh(work / "inverse_render" / "mesh.npz", surface.mesh, **arrays)

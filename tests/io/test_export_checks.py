@@ -8,7 +8,7 @@ import pytest
 from pxr import Usd, UsdGeom
 from shapes import turned
 from toy_export import write_toy_export
-from toy_result import MAP_SIZE
+from toy_result import MAP_SIZE, toy_hair
 
 from shared.io.arrays import load_arrays, save_arrays
 from shared.io.export_checks import check_export, rigid_motions
@@ -20,7 +20,7 @@ ATTRIBUTES = {"unit": "something", "content": "roughness"}
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory):
-    return write_toy_export(tmp_path_factory.mktemp("checked"), plates=False)
+    return write_toy_export(tmp_path_factory.mktemp("checked"), plates=False, hair=True)
 
 
 @pytest.fixture
@@ -53,6 +53,19 @@ def displacement(folder, height):
 def mesh(change):
     def plant(folder):
         write_obj(folder / "mesh.obj", change(read_obj(folder / "mesh.obj")))
+    return plant
+
+
+def hair(change):
+    def plant(folder):
+        write_obj(folder / "hair.obj", change(read_obj(folder / "hair.obj")))
+    return plant
+
+
+def alpha(values):
+    def plant(folder):
+        write_exr(folder / "maps" / "hair_alpha.exr", values, colour_space="data",
+                  attributes={"unit": "x", "content": "hair_alpha"})
     return plant
 
 
@@ -118,6 +131,14 @@ FAULTS = [
     ("mesh.obj: UVs leave the unit square", mesh(lambda m: m.replace(uvs=m.uvs + 0.5))),
     ("mesh.obj: 2 mm is not the size of a head", mesh(lambda m: m.replace(vertices=m.vertices * 0.01))),
     ("mesh.obj: several faces cover", mesh(lambda m: m.replace(uvs=m.uvs * 0.0 + np.abs(m.uvs - 0.25)))),
+    ("hair.obj: missing", remove("hair.obj")),
+    ("hair.obj: UVs leave the unit square", hair(lambda m: m.replace(uvs=m.uvs + 0.5))),
+    ("hair.obj: cannot be read: faces point outside", lambda folder: (folder / "hair.obj").write_text(
+        "v 0 0 0\nvt 0 0\nf 1/1 2/1 3/1\n")),
+    ("maps/hair_alpha.exr: missing", remove("maps/hair_alpha.exr")),
+    ("maps/hair_albedo.exr: missing", remove("maps/hair_albedo.exr")),
+    ("maps/hair_alpha.exr: values up to 1.5", alpha(np.full((16, 16), 1.5))),
+    ("maps/hair_alpha.exr: 12 x 12 is not a square power of two", alpha(np.full((12, 12), 0.5))),
     ("maps/normal.exr: missing", remove("maps/normal.exr")),
     ("maps/roughness.exr: cannot be read", truncate("maps/roughness.exr", 0.1)),
     ("maps/roughness.exr: 12 x 12 is not a square power of two", lambda f: roughness(f, np.full((12, 12), 0.5))),
@@ -161,7 +182,7 @@ FAULTS = [
 def test_a_sound_export_has_no_faults(original):
     found = check_export(original, expected=("head.usdz", "head.glb"))
     assert found.faults == [] and found.unchecked == []
-    assert found.facts == ["UV overlap 0.00%", "7 maps of 16 px"]
+    assert found.facts == ["UV overlap 0.00%", f"hair of {len(toy_hair().mesh.faces)} faces", "7 maps of 16 px"]
 
 
 @pytest.mark.parametrize(("words", "plant"), FAULTS, ids=[f"{k} {words}" for k, (words, _) in enumerate(FAULTS)])
@@ -175,6 +196,11 @@ def test_every_fault_is_named(export, words, plant):
 def test_a_displacement_need_not_have_the_size_of_the_other_maps(export):
     displacement(export, -3.0)
     assert check_export(export).faults == [] and (export / "maps" / "displacement.exr").is_file()
+
+
+def test_maps_of_hair_need_not_have_the_size_of_the_other_maps(export):
+    alpha(half(8))(export)
+    assert check_export(export).faults == []
 
 
 def test_only_overlap_is_no_reason_to_withhold_a_result(export):
