@@ -90,6 +90,9 @@ REFERENCES = {
     "Krahenbuhl2011":
         "Krahenbuhl, Koltun, Efficient Inference in Fully Connected CRFs with Gaussian Edge Potentials. NIPS 2011.",
     "Kroeger2016": "Kroeger et al., Fast Optical Flow using Dense Inverse Search. ECCV 2016.",
+    "Kuhl1982":
+        "Kuhl, Giardina, Elliptic Fourier Features of a Closed Contour. Computer Graphics and Image Processing 18, "
+        "1982.",
     "Laine2020": "Laine et al., Modular Primitives for High-Performance Differentiable Rendering. SIGGRAPH Asia 2020.",
     "Lam1985": "Lam, Metamerism and Colour Constancy. PhD thesis, University of Bradford, 1985.",
     "Lam2015": "Lam, Pitrou, Seibert, Numba: a LLVM-based Python JIT compiler. LLVM-HPC 2015.",
