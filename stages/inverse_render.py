@@ -14,7 +14,8 @@ Method   What no track reaches (ears, skull, jaw) moves until the mesh's outline
          stands at the distance that held-out frames ask for, far away if they ask for none
          (shared/inverse/lamp_distance.py). Exposure that drifts is a gain of each frame (shared/inverse/exposure.py).
          Or (model=auto) how many numbers describe the light, and whether there are highlights, is chosen first, on few
-         points and frames: shared/selection/candidates.py. Then albedo and specular intensity per texel in closed form,
+         points and frames: shared/selection/candidates.py. Then the tracked mesh, not one that is given, gets a smooth
+         rim at the neck (shared/geometry/rim.py). Then albedo and specular intensity per texel in closed form,
          streaming over the frames; samples where a cast shadow ends, which the mesh tells to millimetres only, count
          less. The solver starts from a uniform light and the priors: of one clip it needs no start from init_albedo,
          which is an input for comparison only.
@@ -69,7 +70,7 @@ PUBLISHED = ParameterGroup(
 
 STAGE = Stage(
     name="inverse_render",
-    version=40,
+    version=41,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),

@@ -12,6 +12,7 @@ from shared.appearance.fit import Solution
 from shared.appearance.observations import Capture, build_capture
 from shared.compute.run_context import RunContext
 from shared.geometry.mesh import Mesh
+from shared.geometry.rim import smooth_rim
 from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.turning_eyes import TurningEyes
@@ -65,6 +66,15 @@ class LitSurface:
         seen, whole = SeenLamp.of(lamp, views.camera_from_head, moves), self.coarse is self.capture
         capture = self.capture.under_lamp(seen)
         return replace(self, capture=capture, coarse=capture if whole else self.coarse.under_lamp(seen))
+
+    def with_smooth_rim(self, settings: InverseSettings) -> LitSurface:
+        """The same with a mesh that ends on a smooth curve, and light that bounces between the same vertices of it. Its
+        points and what they show stay: the light is solved."""
+        mesh = smooth_rim(self.surface.mesh)
+        viewer = SurfaceViewer.of(mesh, self.viewer.layout)
+        visibility, directions = settings.appearance.visibility, self.precomputed.directions
+        precomputed = precompute_transfer(viewer, settings.sizes, visibility, directions)
+        return replace(self, surface=self.surface.with_mesh(mesh), viewer=viewer, precomputed=precomputed)
 
 
 def suited_directions(lit: LitSurface, solution: Solution) -> np.ndarray:

@@ -68,6 +68,7 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         normal_map=params.normal_map,
         pose_rounds=params.pose_rounds,
         lamp_distance=read_lamp_distance(params.lamp_distance),
+        smooth_rim=not params.mesh,
         reference=read_reference(params, checkpoint) if params.solver == "reference" else None,
         selection=read_forced(params.fixed_parts) if params.model == "auto" else None,
     )

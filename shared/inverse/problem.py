@@ -38,7 +38,8 @@ class InverseSettings:
     face, 0: all but those held out; reference: solve by the published algorithm instead; selection: choose the model,
     up to what the settings say, and leave only the named parts of it as they say; pose_rounds: how often, at
     most, the frames are tracked again on the refined mesh; lamp_distance: of the light's main lamp, mm, FAR or, None,
-    where held-out frames have it."""
+    where held-out frames have it; smooth_rim: let a mesh with segments, which the head model made, end on a smooth
+    curve."""
 
     sizes: Sizes = field(default_factory=Sizes)
     appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
@@ -52,6 +53,7 @@ class InverseSettings:
     selection: frozenset[str] | None = None
     pose_rounds: int = 3
     lamp_distance: float | None = None
+    smooth_rim: bool = False
 
 
 @dataclass(frozen=True)

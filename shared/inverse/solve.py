@@ -96,6 +96,8 @@ def solve_clip(
     diagnostics, solution, whites = examine(lit, settings.appearance, solution)
 
     # Under that light, of that shape: every texel's material, and relief finer than the mesh.
+    if settings.smooth_rim and surface.face_segment is not None:
+        lit = lit.with_smooth_rim(settings)
     surface, precomputed = lit.surface, lit.precomputed
     viewer = lit.viewer.within_rim(surface_error(surface.tracks))
     covariance, pose_record = shaped.covariance, shaped.pose_record
