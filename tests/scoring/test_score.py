@@ -19,6 +19,7 @@ from shared.io.meshes import read_obj, write_obj
 from tools.scoring import align, measures
 from tools.scoring.buffers import BufferRenderer
 from tools.scoring.score import main, score
+from tools.scoring.table import table
 
 SCALE, TURN, SHIFT = 0.93, rotation_from_vector(np.array([0.1, -0.2, 0.05])), np.array([5.0, -20.0, 33.0])
 GAIN = np.array([0.8, 0.9, 1.1])
@@ -56,7 +57,7 @@ def test_truth_scores_perfectly_against_itself(tmp_path):
     assert scores["pose"]["rotation_deg"]["mean"] < 0.02 and scores["pose"]["frames"] == 12
     assert scores["pose_own_alignment"]["rotation_deg"]["mean"] < 1e-4
     assert scores["normal_deg"]["median"] < 0.6 and scores["mask_coverage"] > 0.8
-    assert scores["albedo"]["raw"]["delta_e2000_median"] < 1
+    assert scores["albedo"]["raw"]["delta_e2000_median"] < 1 and "confident_texels" not in scores
     assert scores["specular"]["correlation"] > 0.9 and scores["roughness"]["rmse"] < 0.02
     assert scores["envmap"]["irradiance_rel_rmse"] < 1e-6
     assert scores["rerender"]["psnr"] > 60 and "relight" not in scores
@@ -230,3 +231,16 @@ def test_missing_files_are_one_line_and_exit_code_two(tmp_path, capsys, missing)
         (export / missing).unlink()
     assert main([str(tmp_path if missing == "gt" else TINY), str(export)]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_all_texels_count_where_the_result_is_confident(tmp_path):
+    """Wrong where no face skin is, in an export in another head frame; the tiny truth has little else."""
+    export = export_from_truth(tmp_path / "export", moved=True, gain=1.0 / GAIN)
+    albedo, skin = read_exr(export / "maps" / "diffuse_albedo.exr"), read_exr(TINY / "gt" / "mask.exr").squeeze()
+    spoilt = np.where(skin[..., None] < 0.5, 0.5 * albedo, albedo)
+    write_exr(export / "maps" / "diffuse_albedo.exr", spoilt, colour_space="data")
+    write_exr(export / "maps" / "confidence.exr", np.full(skin.shape, 0.9, np.float32), colour_space="data")
+    scores = score(TINY, export)
+    assert scores["confident_texels"]["share"] == 1.0 and 0.03 < scores["confident_texels"]["wrong"] < 0.1
+    assert scores["albedo"]["confident"]["acceptable"] > 0.99
+    assert "off by dE2000 6 or more 4." in table(scores)

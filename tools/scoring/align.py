@@ -27,14 +27,21 @@ def sample_surface(
 
     face_weight [F] multiplies each face's area.
     """
+    face, bary = random_places(mesh, count, rng, face_weight)
+    corners, normals = mesh.vertices[mesh.faces[face]], vertex_normals(mesh.vertices, mesh.faces)[mesh.faces[face]]
+    return (corners * bary[..., None]).sum(1), (normals * bary[..., None]).sum(1), face
+
+
+def random_places(
+    mesh: Mesh, count: int, rng: np.random.Generator, face_weight: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Random places, uniform over the area: faces [N] and corner weights [N, 3]; face_weight [F]: times the area."""
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     weight = area if face_weight is None else area * face_weight
     face = rng.choice(len(mesh.faces), count, p=weight / weight.sum())
     root, second = np.sqrt(rng.random(count)), rng.random(count)
-    bary = np.stack([1 - root, root * (1 - second), root * second], 1)[..., None]
-    normals = (vertex_normals(mesh.vertices, mesh.faces)[mesh.faces[face]] * bary).sum(1)
-    return (corners[face] * bary).sum(1), normals, face
+    return face, np.stack([1 - root, root * (1 - second), root * second], 1)
 
 
 def sample_face_skin(mesh: Mesh, mask: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

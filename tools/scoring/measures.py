@@ -14,8 +14,9 @@ from shared.imaging.color import delta_e_2000, encode_srgb
 COVERED_CHI_SQUARED = 6.251
 """90 % of a chi-squared variable of three degrees of freedom."""
 DELTA_E_SAMPLES = 100_000
-CONFIDENT, ACCEPTABLE_DELTA_E = 0.5, 8.0
-"""Confidence from which on a texel counts as seen, and the dE2000 that no such texel should exceed."""
+CONFIDENT, ACCEPTABLE_DELTA_E, WRONG_DELTA_E = 0.5, 8.0, 6.0
+"""Confidence from which on a texel counts as seen, the dE2000 that no such texel of the face's skin should exceed, and
+the one that few of all the head may."""
 CLIPPED = 0.98
 ENVMAP_WIDTH = 96
 ENVMAP_LOBE_SHARPNESS = 12.0

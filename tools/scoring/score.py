@@ -9,6 +9,7 @@ Measures: geometry_mm    distance of the true face's points to the result's surf
          pose            rotation and translation in the aligned head frame; pose_own_alignment leaves the mesh out
          normal_deg, albedo, specular, roughness    in image space, on the face skin of the frames that hold truth;
                          albedo.confident: where maps/confidence.exr, if there is one, is above 0.5
+         confident_texels    where the confidence is above 0.5, anywhere on the head: the share whose albedo is wrong
          envmap          through a cosine and a 25 degree lobe, per-channel gain removed
          rerender, relight   sRGB-coded PSNR on the face skin, raw and with one gain per channel
          gaze, rerender_eyes where the truth has living eyes: degrees between directions, blinks found, and the PSNR on
@@ -46,6 +47,7 @@ from shared.tracking.models import load_head_model
 from tools.scoring import align, gaze, labels, lid_margins, measures
 from tools.scoring.buffers import BufferRenderer
 from tools.scoring.table import table
+from tools.scoring.texel_albedo import albedo_pairs
 
 SCORED_FRAMES = 12
 CONFIDENCE = "confidence"
@@ -104,6 +106,9 @@ def score(
     scores["pose_own_alignment"] = measures.pose_errors_own_alignment(true_poses, found_poses)
     chosen = scored_frames(truth["gt_frames"], result, frame_count)
     scores |= score_appearance(subject, result, chosen, alignment.rotation, rng)
+    if {"albedo", CONFIDENCE} <= result.textures.keys() and (subject / "gt" / "albedo.exr").exists():
+        gain = np.array(scores["albedo"]["gain"])
+        scores["confident_texels"] = score_texels(subject, result, true_poses, alignment, gain, rng)
     if "gaze" in truth:
         scores |= score_eyes(subject, export, truth, alignment.rotation)
     if labels.label_files(subject / "gt" / "frames") and (export / "maps" / "material.exr").exists():
@@ -186,6 +191,19 @@ def score_appearance(
     return scores
 
 
+def score_texels(
+    subject: Path, result: ScoredResult, true_poses: np.ndarray, truth_from_result: align.Similarity, gain: np.ndarray,
+    rng: np.random.Generator,
+) -> dict:
+    """Of the whole head, see texel_albedo: {share, wrong}, and of_segments where the stages' folders are beside the
+    export; true_poses [F, 4, 4]; gain [3]: the albedo's, on face skin."""
+    truth = read_obj(subject / "gt" / "mesh.obj"), read_exr(subject / "gt" / "albedo.exr"), true_poses
+    own = result.mesh, result.textures["albedo"], result.textures[CONFIDENCE]
+    surface = segmented_surface(result.folder)
+    segments = () if surface is None else (surface.face_segment, surface.segment_names)
+    return albedo_pairs(truth, own, truth_from_result, rng).wrong_where_sure(gain, *segments)
+
+
 def read_render(export: Path, frame: int) -> np.ndarray | None:
     """[H, W, 3] linear: a re-render of a frame without the frame's own gain, which truth has none of; None where there
     is none."""
@@ -225,13 +243,8 @@ def score_eyes(subject: Path, export: Path, truth: dict[str, np.ndarray], truth_
 def score_lids(subject: Path, export: Path, truth: dict[str, np.ndarray]) -> dict | None:
     """How far the mesh's lids, as the export moves them, are from the truth's, see lid_margins, in frames with open
     eyes; None where the stages' folders are not beside the export, or the head has no eyeballs."""
-    mesh_path = export.parent / "work" / "inverse_render" / "mesh.npz"
-    tracking_path = export.parent / "work" / "track_landmarks" / "tracking.json"
-    if not (mesh_path.exists() and tracking_path.exists()):
-        return None
-    segment, names = load_arrays(mesh_path).get("face_segment"), tuple(read_json(tracking_path)["segments"])
-    surface = Surface(load_mesh(mesh_path), segment, names)
-    if eyeballs_of(surface) is None:
+    surface = segmented_surface(export)
+    if surface is None or eyeballs_of(surface) is None:
         return None
     eyes, scene_of = surface.faces_of(("eyes",)), _scenes_with_lids(export, surface)
     result, radius, pairs = load_result(export, camera_intrinsics(subject)), float(truth["eyeball_radius"]), []
@@ -249,6 +262,17 @@ def score_lids(subject: Path, export: Path, truth: dict[str, np.ndarray]) -> dic
             pixel_mm = (pose[:3, :3] @ centre + pose[:3, 3])[2] / lens[0, 0]
             pairs.append((seen, found & own, pixel_mm))
     return lid_margins.lid_margin_errors(pairs)
+
+
+def segmented_surface(export: Path) -> Surface | None:
+    """The mesh with its segments, as the stages' folders beside the export have it; None where they are not there."""
+    mesh_path = export.parent / "work" / "inverse_render" / "mesh.npz"
+    tracking_path = export.parent / "work" / "track_landmarks" / "tracking.json"
+    if not (mesh_path.exists() and tracking_path.exists()):
+        return None
+    names = tuple(read_json(tracking_path).get("segments", ()))
+    segment = load_arrays(mesh_path).get("face_segment")
+    return None if segment is None else Surface(load_mesh(mesh_path), segment, names)
 
 
 def _scenes_with_lids(export: Path, surface: Surface) -> Callable[[int], RayScene]:

@@ -46,12 +46,21 @@ def _appearance_lines(scores: dict) -> list[tuple[str, str]]:
         lines += [("albedo", title + ALBEDO.format(**scores["albedo"][name])) for name, title in ALBEDO_NAMES.items()]
         if "acceptable" in (confident := scores["albedo"].get("confident", {})):
             lines.append(("albedo", CONFIDENT.format(**confident)))
+    if "confident_texels" in scores:
+        lines.append(("all texels", _all_texels(scores["confident_texels"])))
     lines += [(name, SCALAR.format(**scores[name])) for name in ("specular", "roughness") if name in scores]
     if "envmap" in scores:
         lines.append(("light", LIGHT.format(**scores["envmap"])))
     if "rerender" in scores:
         lines.append(("re-render", GAINS.format(**scores["rerender"])))
     return lines + [(f"relight {light}", GAINS.format(**value)) for light, value in scores.get("relight", {}).items()]
+
+
+def _all_texels(texels: dict) -> str:
+    """How much of the head is confident and wrong, and the three segments with most of that."""
+    worst = ", ".join(f"{name} {part:.1%}" for name, part in list(texels.get("of_segments", {}).items())[:3])
+    text = f"confident {texels['share']:.1%}, of these off by dE2000 6 or more {texels['wrong']:.1%}"
+    return text + (f" ({worst})" if worst else "")
 
 
 def _label_lines(scores: dict) -> list[tuple[str, str]]:
