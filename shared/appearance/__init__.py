@@ -2,6 +2,6 @@
 
 Read in this order: albedo_scale, chart_scale, eye_whites, observations, light, light_models, sample_errors, skin_prior,
 products, transport, problem, projection, preconditioner, light_step, texture, light_weights, local_roughness, fit,
-diagnostics, eye_albedo, catchlights, texture_pass, fine_normals, maps, material_features, material_mixture.
+diagnostics, eye_albedo, catchlights, texture_pass, fine_normals, confidence, maps, material_features, material_mixture.
 May import: compute, geometry, imaging, capture, rendering.
 """

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from shared.appearance.confidence import texel_confidence
 from shared.appearance.fine_normals import normal_image
-from shared.appearance.texture import PRIOR_SPREAD, TexelMaterial
+from shared.appearance.texture import TexelMaterial
 from shared.geometry.eyeballs import EYE_ROUGHNESS
 from shared.imaging.texels import TexelSurface
 
@@ -16,11 +17,12 @@ def make_maps(
     roughness: float | np.ndarray,
     turn: np.ndarray | None = None,
     eyes: np.ndarray | None = None,
+    resolved: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """UV-space images with filled gutters; roughness: one, or each vertex's [V]; turn [T, 2]: of the normals, None:
-    they are the mesh's; eyes [E]: texels of the eyeballs, which are as smooth as tears, None: none are; confidence is
-    the share of the prior's variance that the clip removed."""
-    confidence = PRIOR_SPREAD**2 / (PRIOR_SPREAD**2 + 1.0 / np.maximum(material.information, 1e-9))
+    they are the mesh's; eyes [E]: texels of the eyeballs, which are as smooth as tears, None: none are; resolved: as
+    of texel_confidence."""
+    confidence = texel_confidence(surface, material, resolved)
     at_vertices = np.broadcast_to(np.asarray(roughness), len(surface.mesh.vertices))[:, None]
     rough = surface.interpolate(at_vertices)[:, 0]
     if eyes is not None:

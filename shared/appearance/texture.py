@@ -89,11 +89,13 @@ class Noise:
 @dataclass(frozen=True)
 class TexelMaterial:
     """albedo [T, 3] and specular [T] of the texels, information [T]: precision of the log albedo by
-    the samples, in the channel that they determine least."""
+    the samples, in the channel that they determine least; unmodelled [T]: variance of it by what the model does not
+    have, of which the samples say nothing; None: by nothing."""
 
     albedo: np.ndarray
     specular: np.ndarray
     information: np.ndarray
+    unmodelled: np.ndarray | None = None
 
     def radiance(self, rows: np.ndarray, irradiance: np.ndarray, reflection: np.ndarray) -> np.ndarray:
         """a E + s S of the texels rows [n]; irradiance E [n, 3], reflection S [n, 3] -> [n, 3] float32."""
@@ -195,8 +197,12 @@ class NormalEquations:
         """[T, 3] of the log albedo, since highlights of intensity `specular`, one or [T], are wrong by HIGHLIGHT_ERROR
         of themselves: little where they are a small share of what a texel sends out, all of it in hair that the model
         gives a skin's specular intensity."""
-        share = np.reshape(specular, (-1, 1)) * self.es / np.maximum(self.ei, 1e-9)
+        share = self.highlight_share(specular)
         return np.square(HIGHLIGHT_ERROR * share / np.maximum(1.0 - share, LEAST_MATTE_SHARE))
+
+    def highlight_share(self, specular: float | np.ndarray) -> np.ndarray:
+        """[T, 3]: of what a texel sends out, by highlights of intensity `specular`, one or [T]."""
+        return np.reshape(specular, (-1, 1)) * self.es / np.maximum(self.ei, 1e-9)
 
     def _spared(self) -> np.ndarray:
         """[T, 3]: share of the samples that is not clipped, by EE."""

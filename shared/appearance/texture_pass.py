@@ -125,7 +125,7 @@ class TexturePass:
         self.sigma, self.noise, self.progress = sigma, noise or Noise(), context.progress
         self.shines = np.ones(len(surface), np.float32) if matt is None else self._at_texels(1.0 - matt)
         self.seen = None if hidden is None else self._at_texels(1.0 - hidden)
-        self.specular = self._with_eyes(specular * self.shines)
+        self.specular, self.lobe = self._with_eyes(specular * self.shines), specular
         self.region = region
         self.bare = 1.0 if bare is None else surface.interpolate(bare[:, None].astype(np.float32))
         self.hidden_variance = 0.0
@@ -155,6 +155,8 @@ class TexturePass:
         pooled = [self._with_eyes(self.specular + self.shines * (intensity - self.specular)) for intensity in pooled]
         candidates, around = zip(*self._close(evidence, pooled, fields), strict=True)
         told = evidence.information.max(1)
+        # What grows there shines along its strands, as bright as skin does or not at all: the model has none of it.
+        strands = (1.0 - self.shines) * evidence.equations.highlight_share(self.lobe).max(1)
         del evidence, fields  # a hundred bytes per texel that the frames to come need
         errors = np.reshape(self.held_out_errors(candidates), (len(CONTRADICTED), len(widths)))
         way = int(errors[1].min() < LEAST_GAIN * errors[0].min())
@@ -167,7 +169,8 @@ class TexturePass:
                              "chosen": CONTRADICTED[way]},
         }
         chosen = way * len(widths) + best
-        return self._without_seams(candidates[chosen], around[chosen], told), record
+        material = self._without_seams(candidates[chosen], around[chosen], told)
+        return replace(material, unmodelled=np.square(strands)), record
 
     def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> Evidence:
         parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]

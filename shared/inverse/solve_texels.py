@@ -84,17 +84,17 @@ def solve_texels(
     )
     widths = settings.map_size * np.array(SPECULAR_WIDTHS if settings.appearance.specular else (np.inf,))
     material, texture_record = texture.run(widths)
-    turn, relief = None, {}
+    turn, relief, resolved = None, {}, resolved_texels(texels, views)
     if settings.normal_map:
         fine = NormalPass(texels, viewer, shading, views, material, context)
-        turn, relief = fine.run(resolved_texels(texels, views))
+        turn, relief = fine.run(resolved)
         if eye_texels is not None:
             turn[eye_texels.rows] = 0.0  # it was seen where the texel does not stay
         context.note(f"fine normals: {relief}")
     catchlights = None if eyes is None else check_catchlights(views, eyes, EyeShine(viewer, shading, eyes))
     roughness, local = solution.state.roughness, solution.local_roughness_fit
     roughness = roughness if local is None else local.roughness(texels.mesh.vertices)
-    maps = make_maps(texels, material, roughness, turn, None if eye_texels is None else eye_texels.rows)
+    maps = make_maps(texels, material, roughness, turn, None if eye_texels is None else eye_texels.rows, resolved)
     record = {
         "texture": texture_record,
         "relief": relief,
