@@ -7,6 +7,7 @@ import shutil
 import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
 from toy_runs import CURRENT_STAGES, limn, limn_process, make_subject, tree, wait_for
 
@@ -140,6 +141,24 @@ def test_gates_of_the_tracking_say_a_wrong_lens_and_a_head_that_hardly_turns(tmp
 def test_gate_limits():
     assert Gate(least=0.5).holds(0.5) and not Gate(least=0.5).holds(0.49)
     assert Gate(0.1, 0.2).holds(0.15) and not Gate(0.1, 0.2).holds(0.3) and not Gate(most=1.0).holds(float("nan"))
+
+
+def test_hair_is_no_fault_of_a_clip(tmp_path):
+    """A quarter of the map is hair with little confidence, another is not seen."""
+    from shared.contract.folders import RunFolder
+    from shared.imaging.material_labels import HAIR, LABELS, SKIN
+    from shared.io.images import write_exr
+    from shared.io.material_maps import write_material
+    from tools.cli.measures import confidence, coverage
+
+    run, maps = RunFolder(tmp_path), tmp_path / "export" / "maps"
+    maps.mkdir(parents=True)
+    label, values = np.full((8, 8), SKIN), np.full((8, 8), 0.9, np.float32)
+    label[:4, :4], values[:4, :4], values[4:, 4:] = HAIR, 0.2, 0.0
+    write_exr(maps / "confidence.exr", values, colour_space="data")
+    assert coverage(run) == pytest.approx(2 / 3)
+    write_material(maps / "material.exr", np.eye(len(LABELS), dtype=np.float32)[label], half=True, attributes={})
+    assert coverage(run) == 1.0 and confidence(run) == pytest.approx(0.9)
 
 
 def test_gates_of_a_real_result(tiny_run, tmp_path):

@@ -76,13 +76,13 @@ def held_out_residual(run: RunFolder) -> float | None:
 
 
 def coverage(run: RunFolder) -> float | None:
-    """Share of the map's seen texels that the clip determines well (confidence above 0.5)."""
+    """Share of the map's seen texels, hair aside, that the clip determines well (confidence above 0.5)."""
     seen = _seen(run)
     return None if seen is None or not seen.size else float((seen > DETERMINED).mean())
 
 
 def confidence(run: RunFolder) -> float | None:
-    """Median confidence of the texels that are seen at all."""
+    """Median confidence of the texels, hair aside, that are seen at all."""
     import numpy as np
 
     seen = _seen(run)
@@ -101,13 +101,20 @@ def confidence_map(run: RunFolder) -> Path:
 
 
 def _seen(run: RunFolder) -> np.ndarray | None:
+    """[n] confidence of texels that frames show and that are not hair: no clip tells much of that, however good it is.
+    """
     path = confidence_map(run)
     if not path.is_file():
         return None
+    from shared.imaging.material_labels import HAIR
     from shared.io.images import read_exr
+    from shared.io.material_maps import read_material
 
-    values = read_exr(path)
-    return values[values > 0]
+    values, materials = read_exr(path), path.with_name("material.exr")
+    seen = values > 0
+    if materials.is_file():
+        seen &= (read_material(materials).argmax(-1) != HAIR).reshape(seen.shape)
+    return values[seen]
 
 
 def _number(record: object, name: str) -> float | None:
