@@ -1,7 +1,9 @@
 """How much of a shell about the head is hair: alpha, by what frames show where it lies.
 
-Each texel of the shell is looked at in all frames that face it; what is hair in most of them is hair. Hair grows
-downwards: what is not connected to the crown is something else. Where no frame looks, hair goes on as it is beside.
+Each texel of the shell is looked at in all frames that face it. Their evidence is multiplied, not averaged: a place
+before the neck shows dark hair behind it from one side, and skin from another, and is nothing itself (as space carving
+has it, [Kutulakos2000]). Hair grows downwards: what is not connected to the crown is something else. Where no frame
+looks, hair goes on as it is beside.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 
 from shared.geometry.mesh import diffused, mesh_edges
+from shared.geometry.raycast import RayScene
 from shared.hair.shell_grid import ShellGrid
 from shared.imaging.image_sampling import Picture, SurfaceViewer
 from shared.imaging.texels import TexelSurface
@@ -29,7 +32,9 @@ HELD, GOES_ON = 10.0, (3.0, 0.5)
 """How much what is seen counts beside one step from place to place, and such steps around and down: unseen, hair ends
 where it does beside."""
 EDGE = 0.4, 0.7
-"""Share of the frames that show hair from which on something, and everything, of a texel is hair."""
+"""Share of hair that frames agree on from which on something, and everything, of a texel is hair."""
+LEAST_SHARE = 0.02
+"""Of hair in a pixel, by what is believed of it: no frame alone rules hair out."""
 LEAST_COSINE = 0.05
 """Of a look that tells where hair ends: at its border it curves away."""
 BORDER_STEPS = 2
@@ -37,17 +42,21 @@ BORDER_STEPS = 2
 
 @dataclass(frozen=True, eq=False)
 class SeenHair:
-    """Of a shell's texels: how often frames look at them, by squared view cosine [T], and how much of that is hair
-    [T]."""
+    """Of a shell's texels: how often frames look at them, by squared view cosine [T], and the mean of the logarithm of
+    the share of hair that these show there [T]."""
 
     looks: np.ndarray
-    hair: np.ndarray
+    log_hair: np.ndarray
 
 
-def look_for_hair(grid: ShellGrid, texels: TexelSurface, kinds: Mapping[int, np.ndarray], views: Views) -> SeenHair:
+def look_for_hair(grid: ShellGrid, texels: TexelSurface, kinds: Mapping[int, np.ndarray], views: Views,
+                  share: np.ndarray | None = None) -> SeenHair:
     """What frames show at the shell's texels; kinds {frame: [H, W, 3]}: share of hair, skin and cloth in its pixels, 0
-    of all where there is nobody. About the skull the background says nothing: the shell is a little too wide there."""
-    viewer = SurfaceViewer.of(texels.mesh)
+    of all where there is nobody; share [V]: of hair at the vertices, as far as it is known: looks go past what is not;
+    None: all is there. About the skull the background says nothing: the shell is a little too wide there."""
+    mesh = texels.mesh
+    there = np.ones(len(mesh.faces), bool) if share is None else share[mesh.faces].mean(1) > 0.5
+    viewer = SurfaceViewer(mesh, RayScene(mesh.vertices, mesh.faces[there]))
     viewer.least_cosine = LEAST_COSINE
     looks, hair = np.zeros((2, len(texels)))
     hangs = np.repeat((np.arange(len(grid.base)) >= grid.domed)[:, None], grid.columns, 1)
@@ -60,15 +69,16 @@ def look_for_hair(grid: ShellGrid, texels: TexelSurface, kinds: Mapping[int, np.
         share, weight = np.clip(samples.colours, 0.0, 1.0), samples.weight
         person = share.sum(1).clip(max=1.0)
         facing = hangs[samples.rows] * np.clip((weight - BESIDE[0]) / (BESIDE[1] - BESIDE[0]), 0.0, 1.0)
-        looks[samples.rows] += weight * (person + (1.0 - person) * facing)
-        hair[samples.rows] += weight * share[:, 0]
-    return SeenHair(looks, hair)
+        weight = weight * (person + (1.0 - person) * facing)
+        looks[samples.rows] += weight
+        hair[samples.rows] += weight * np.log(np.maximum(share[:, 0], LEAST_SHARE))
+    return SeenHair(looks, hair / np.maximum(looks, 1e-9))
 
 
 def covered(grid: ShellGrid, texels: TexelSurface, seen: SeenHair) -> np.ndarray:
     """[V] in 0 .. 1 of the shell's vertices: how much hair there is, also where no frame looks."""
-    means, weight = texels.to_vertices((seen.hair / np.maximum(seen.looks, 1e-9))[:, None], seen.looks[:, None])
-    means, weight = grid.of_grid(means[:, 0]), grid.of_grid(weight[:, 0])
+    means, weight = texels.to_vertices(seen.log_hair[:, None], seen.looks[:, None])
+    means, weight = grid.of_grid(np.exp(means[:, 0])), grid.of_grid(weight[:, 0])
     known = weight / (weight + SEEN_WELL)
     share = np.clip(grid.smoothest(means, HELD * known, 0.0, *GOES_ON), 0.0, 1.0)
     share = grid.of_vertices(share)
@@ -86,7 +96,7 @@ def alpha_of(texels: TexelSurface, seen: SeenHair, share: np.ndarray) -> np.ndar
     """[T] float32 in 0 .. 1: the share of hair at texels, sharper than frames that are a little apart have it; share
     [V]: at the vertices, which speaks where frames do not look."""
     around = texels.interpolate(share[:, None])[:, 0]
-    own = (seen.hair + LEAST_SEEN * around) / (seen.looks + LEAST_SEEN)
+    own = (seen.looks * np.exp(seen.log_hair) + LEAST_SEEN * around) / (seen.looks + LEAST_SEEN)
     own = np.where(around > 0.0, own, 0.0)
     low, high = EDGE
     step = np.clip((own - low) / (high - low), 0.0, 1.0)

@@ -102,7 +102,8 @@ def find_hair(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray, vi
     bare = (share < 0.5) & (np.arange(len(share)) < grid.domed)[:, None]
     radius, said = hull_radius(grid, solids, views, bare)
     shell = TexelSurface(grid.mesh(radius), size)
-    seen = look_for_hair(grid, shell, kinds, views)
+    share = covered(grid, shell, look_for_hair(grid, shell, kinds, views))
+    seen = look_for_hair(grid, shell, kinds, views, share)  # past what is before the face
     share = covered(grid, shell, seen)
     alpha = shell.dilated(shell.to_image(alpha_of(shell, seen, share)))
     head = _pressed(viewer.mesh, surface, grid, radius, grid.of_grid(share))

@@ -99,6 +99,8 @@ REFERENCES = {
     "Lange1989":
         "Lange, Little, Taylor, Robust Statistical Modeling Using the t Distribution. Journal of the American "
         "Statistical Association 84, 1989.",
+    "Kutulakos2000":
+        "Kutulakos, Seitz, A Theory of Shape by Space Carving. International Journal of Computer Vision 38 (3), 2000.",
     "Laurentini1994":
         "Laurentini, The Visual Hull Concept for Silhouette-Based Image Understanding. IEEE Transactions on Pattern "
         "Analysis and Machine Intelligence 16 (2), 1994.",
