@@ -69,9 +69,10 @@ def look_for_hair(grid: ShellGrid, texels: TexelSurface, kinds: Mapping[int, np.
         share, weight = np.clip(samples.colours, 0.0, 1.0), samples.weight
         person = share.sum(1).clip(max=1.0)
         facing = hangs[samples.rows] * np.clip((weight - BESIDE[0]) / (BESIDE[1] - BESIDE[0]), 0.0, 1.0)
-        weight = weight * (person + (1.0 - person) * facing)
-        looks[samples.rows] += weight
-        hair[samples.rows] += weight * np.log(np.maximum(share[:, 0], LEAST_SHARE))
+        beside = (1.0 - person) * facing
+        told = person * np.log(np.maximum(share[:, 0] / np.maximum(person, 1e-6), LEAST_SHARE))
+        looks[samples.rows] += weight * (person + beside)
+        hair[samples.rows] += weight * (told + beside * np.log(LEAST_SHARE))
     return SeenHair(looks, hair / np.maximum(looks, 1e-9))
 
 

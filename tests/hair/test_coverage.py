@@ -41,6 +41,28 @@ def views():
     return Views.in_one_light(nods(np.linspace(-40.0, 40.0, 5)), LENS, SIZE, "head", None, None)
 
 
+def test_looks_go_past_what_is_not_hair(shell, views):
+    """A ridge before the face hides its own flank from the frames at its other side, unless it is not there."""
+    grid, _ = shell
+    azimuth = 2.0 * np.pi * np.arange(grid.columns) / grid.columns
+    ridge = SHELL_MM + 30.0 * np.exp(-np.minimum(azimuth, 2.0 * np.pi - azimuth) ** 2 / 0.02)
+    texels = TexelSurface(grid.mesh(np.broadcast_to(ridge, grid.base.shape)), 128)
+    kinds = kinds_of(views, lambda places: np.zeros(len(places), int))
+    there = look_for_hair(grid, texels, kinds, views).looks
+    past = look_for_hair(grid, texels, kinds, views, np.zeros(len(texels.mesh.vertices))).looks
+    assert (past >= there - 1e-6).all() and (past > there + 0.1).sum() > 50
+
+
+def test_one_side_that_shows_skin_rules_hair_out(shell, views):
+    """Frames from one side show hair at a place, those from the other skin: that is no hair, whatever the mean says."""
+    grid, texels = shell
+    hair, skin = (kinds_of(views, lambda places, kind=kind: np.full(len(places), kind)) for kind in (0, 1))
+    mixed = {f: skin[f] if f == 2 else hair[f] for f in hair}
+    seen = look_for_hair(grid, texels, mixed, views)
+    front = (texels.interpolate(texels.mesh.vertices)[:, 2] > 75.0) & (seen.looks > 0.5)
+    assert front.any() and np.exp(seen.log_hair[front]).max() < 0.55
+
+
 def look(shell, views, shown):
     grid, texels = shell
     seen = look_for_hair(grid, texels, kinds_of(views, shown), views)
