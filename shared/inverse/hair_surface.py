@@ -166,10 +166,10 @@ def _pressed(mesh: Mesh, surface: Surface, grid: ShellGrid, radius: np.ndarray, 
     places = np.array(mesh.vertices)
     index = np.nonzero(surface.vertices_of(BENEATH))[0]
     row, column, out = grid.locate(places[index])
-    most = grid.read(radius, row, column) - GAP_MM
+    most = np.maximum(grid.read(radius, row, column) - GAP_MM, LEAST_MM)
     over = (grid.read(share, row, column) > 0.5) & (out > most)
+    index, row, shrink = index[over], row[over], (most / np.maximum(out, 1e-6))[over]
     axis = np.where((row < grid.domed - 1)[:, None], grid.centre, places[index] * [0, 1, 0] + grid.centre * [1, 0, 1])
-    shrink = np.where(over, np.maximum(most, LEAST_MM) / np.maximum(out, 1e-6), 1.0)
     places[index] = axis + shrink[:, None] * (places[index] - axis)
     return mesh.replace(vertices=places)
 

@@ -93,14 +93,14 @@ REFERENCES = {
     "Kuhl1982":
         "Kuhl, Giardina, Elliptic Fourier Features of a Closed Contour. Computer Graphics and Image Processing 18, "
         "1982.",
+    "Kutulakos2000":
+        "Kutulakos, Seitz, A Theory of Shape by Space Carving. International Journal of Computer Vision 38 (3), 2000.",
     "Laine2020": "Laine et al., Modular Primitives for High-Performance Differentiable Rendering. SIGGRAPH Asia 2020.",
     "Lam1985": "Lam, Metamerism and Colour Constancy. PhD thesis, University of Bradford, 1985.",
     "Lam2015": "Lam, Pitrou, Seibert, Numba: a LLVM-based Python JIT compiler. LLVM-HPC 2015.",
     "Lange1989":
         "Lange, Little, Taylor, Robust Statistical Modeling Using the t Distribution. Journal of the American "
         "Statistical Association 84, 1989.",
-    "Kutulakos2000":
-        "Kutulakos, Seitz, A Theory of Shape by Space Carving. International Journal of Computer Vision 38 (3), 2000.",
     "Laurentini1994":
         "Laurentini, The Visual Hull Concept for Silhouette-Based Image Understanding. IEEE Transactions on Pattern "
         "Analysis and Machine Intelligence 16 (2), 1994.",
