@@ -274,10 +274,11 @@ def light_moves(job: Job, moves: str) -> str:
     return "head" if job.manifest("inverse_render")["parameters"].get("light_model") == "camera" else moves
 
 
-def render_views(job: Job, writer, mesh, maps: dict, eyes, actions, envmap, poses: dict, frames, solve: dict):
+def render_views(job: Job, writer, mesh, maps: dict, eyes, actions, envmap, poses: dict, frames, solve: dict,
+                 head_faces: int | None):
     """Writes views/novel_*.exr, views/relit_*.exr and the lights -> the ViewSet; None when switched off. mesh, maps:
     the head's, joined with those of its hair where that stands off it; eyes, actions: of the head, whose vertices and
-    faces come first."""
+    faces come first; head_faces: how many these are then, None: all."""
     from shared.geometry.blend_shapes import LidActions
     from shared.imaging.turning_eyes import TurningEyes
     from shared.rendering.near_lamp import NearLamp
@@ -290,7 +291,7 @@ def render_views(job: Job, writer, mesh, maps: dict, eyes, actions, envmap, pose
     views = make_views(
         mesh, maps, envmap, camera_from_head=poses["camera_from_head"], moves=moves, pixels=job.params.view_size,
         held_out=cameras, progress=job.progress, lamp=NearLamp.of_record(solve.get("lamp") or {}),
-        eyes=TurningEyes(mesh, eyes) if eyes else None, lids=LidActions.of(actions),
+        eyes=TurningEyes(mesh, eyes) if eyes else None, lids=LidActions.of(actions), head_faces=head_faces,
     )
     (job.out / "views").mkdir()
     pictures = {f"novel_{name}": picture for name, picture in views.novel.items()}
@@ -435,7 +436,8 @@ def run(job: Job) -> None:
     asset = describe_asset(job, mesh, eyes, actions, details, base, strands, capture, frames, writer, lamp)
     write_assets(job, asset, eyeballs, poses, maps, far)
     seen = (mesh, maps) if hair is None else (joined_mesh(mesh, hair.mesh), joined_maps(maps, hair))
-    views = render_views(job, writer, *seen, eyes, actions, envmap, poses, frames, solve)
+    head_faces = None if hair is None else len(mesh.faces)
+    views = render_views(job, writer, *seen, eyes, actions, envmap, poses, frames, solve, head_faces)
     record = run_record(job, mesh, said_of_them, solve, time.perf_counter() - start)
     write_json(job.out / "run.json", record)
     methods = method_records(job, record, solve)

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from shared.appearance.fit import Solution
-from shared.appearance.problem import AppearanceSettings
+from shared.appearance.observations import face_front
 from shared.appearance.texture_pass import TexturePass
 from shared.compute.run_context import SILENT, RunContext
 from shared.geometry.mesh import Mesh
@@ -16,16 +15,16 @@ from shared.geometry.surface import Surface
 from shared.hair.coverage import alpha_of, covered, look_for_hair
 from shared.hair.hair_pixels import CLOTH_PIXEL, HairPixels
 from shared.hair.hull import LEAST_MM, hull_radius
-from shared.hair.joined import HairSurface, joined_surface
+from shared.hair.joined import HAIR_ROUGHNESS, HairSurface, joined_surface
 from shared.hair.shell_grid import ShellGrid
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer, sample_colours
 from shared.imaging.texels import TexelSurface
 from shared.imaging.views import Views
-from shared.inverse.problem import shade_vertices
-from shared.rendering.precomputed_transfer import PrecomputedTransfer, Sizes, precompute_transfer
+from shared.rendering.precomputed_transfer import PrecomputedTransfer
 from shared.rendering.render import solid_viewer
 from shared.rendering.shading import VertexShading
+from shared.rendering.transfer import mesh_points
 
 FRAMES, COLOUR_FRAMES = 24, 8
 """That hair is looked for in, and that its mean colour is taken from."""
@@ -39,6 +38,8 @@ LEAST_SHARE, SURE = 0.2, 0.8
 """Of hair at a face's corners below which there is no surface, and from which on its colour is hair's."""
 BENEATH = ("scalp", "ears", "forehead")
 """Segments that hair may press flat."""
+FACED = -0.1
+"""Least cosine to some view of a vertex that is lit: those around what is seen are, too."""
 GAP_MM = 1.0
 """Between hair and what it presses flat."""
 
@@ -117,22 +118,26 @@ def find_hair(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray, vi
     return StandingHair(mesh, share[used], alpha, head, record)
 
 
-def light_hair(hair: StandingHair, surface: Surface, views: Views, precomputed: PrecomputedTransfer, sizes: Sizes,
-               appearance: AppearanceSettings, solution: Solution, error_mm: float, context: RunContext) -> HairyHead:
-    """Both under the solved light, shading each other. surface, precomputed: the head's; error_mm: of its surface."""
-    before = precomputed.nodes.points.positions
+def light_hair(hair: StandingHair, surface: Surface, views: Views, precomputed: PrecomputedTransfer,
+               shading: VertexShading, error_mm: float) -> HairyHead:
+    """Hair under the solved light, shaded by itself and by the head, which it casts no shadow on (see
+    PrecomputedTransfer.with_standing). surface, precomputed, shading: the head's; error_mm: of its surface."""
     both = joined_surface(surface.with_mesh(hair.head), hair.mesh)
     alpha = np.concatenate([np.ones_like(hair.alpha), hair.alpha], axis=1)
-    viewer = solid_viewer(both.mesh, alpha).within_rim(error_mm)
-    again = precompute_transfer(viewer, sizes, precomputed.visibility, precomputed.directions)
-    places = again.nodes.points.positions
-    nearest = np.argmin(((places[:, None] - before) ** 2).sum(-1), axis=1)
-    state = replace(solution.state, node_albedo=solution.state.node_albedo[nearest])
-    shading = shade_vertices(views, viewer, again, appearance, replace(solution, state=state), context)
-    count, joined = len(surface.mesh.faces), both.mesh
-    head = Mesh(joined.vertices, joined.faces[:count], surface.mesh.uvs, surface.mesh.face_uvs)
-    own = Mesh(joined.vertices, joined.faces[count:], hair.mesh.uvs, hair.mesh.face_uvs)
-    return HairyHead(both, viewer, shading, head, own)
+    viewer, count = solid_viewer(both.mesh, alpha).within_rim(error_mm), len(surface.mesh.vertices)
+    faced = np.nonzero(face_front(viewer, views.camera_from_head, FACED))[0]
+    index = faced[faced >= count]
+    points = mesh_points(both.mesh, index)
+    transfer = shading.transfer.followed_by(precomputed.with_standing(viewer).trace(points))
+    material, local = shading.material, shading.material.local_roughness
+    if local is not None:
+        material = replace(material, local_roughness=np.append(local, np.full(len(index), HAIR_ROUGHNESS)))
+    joined, faces = both.mesh, len(surface.mesh.faces)
+    lit = shading.of_points(np.append(shading.index, index), joined.vertices, shading.points.followed_by(points),
+                            transfer, material)
+    head = Mesh(joined.vertices, joined.faces[:faces], surface.mesh.uvs, surface.mesh.face_uvs)
+    own = Mesh(joined.vertices, joined.faces[faces:], hair.mesh.uvs, hair.mesh.face_uvs)
+    return HairyHead(both, viewer, lit, head, own)
 
 
 def texture_hair(hair: StandingHair, lit: HairyHead, views: Views, context: RunContext) -> HairSurface:

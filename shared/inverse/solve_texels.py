@@ -56,7 +56,7 @@ def solve_texels(
     solution: Solution, stands_off: bool, context: RunContext,
 ) -> SolvedTexels:
     """surface, viewer, precomputed: of the solved mesh; stands_off: whether frames show that the scalp is not the
-    head's outline, so that hair has a surface of its own, which shades the skin."""
+    head's outline, so that hair has a surface of its own."""
     shading = shade_vertices(views, viewer, precomputed, settings.appearance, solution, context)
     texels, mesh = TexelSurface(surface.mesh, settings.map_size), surface.mesh
     typical = np.median(solution.state.albedo, axis=0)
@@ -69,8 +69,7 @@ def solve_texels(
     if scalp is not None and stands_off:
         standing = find_hair(viewer, surface, materials, views, settings.map_size, context)
     if standing is not None:
-        lit = light_hair(standing, surface, views, precomputed, settings.sizes, settings.appearance, solution,
-                         viewer.error_mm, context)
+        lit = light_hair(standing, surface, views, precomputed, shading, viewer.error_mm)
         viewer, shading, surface, mesh = lit.viewer, lit.shading, lit.surface, standing.head
         texels = TexelSurface(lit.head, settings.map_size)
         scalp, hidden, matt, bare = (lit.with_hair(values) for values in (scalp, hidden, matt, bare))

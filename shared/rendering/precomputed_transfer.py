@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from shared.geometry.mesh import normalised
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import fibonacci_sphere
 from shared.imaging.image_sampling import SurfaceViewer
-from shared.rendering.transfer import Nodes, Points, Transfer, bounce_nodes, trace_transfer
+from shared.rendering.transfer import Nodes, Points, Transfer, bounce_nodes, nearest_points, trace_transfer
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,18 @@ class PrecomputedTransfer:
         return trace_transfer(
             self.scene, points, self.nodes, self.directions, progress=progress, visibility=self.visibility
         )
+
+
+    def with_standing(self, viewer: SurfaceViewer) -> PrecomputedTransfer:
+        """For points of what stands off the head: of a viewer's mesh, whose first faces are the head's. It is shaded by
+        all that is there and lit by the head's nodes, and casts no shadow on the head itself, whose light was solved
+        without it: a shell about hair that lies on the skin would leave it no light."""
+        mesh, count = viewer.mesh, len(self.nodes.of_face)
+        centres = Points(mesh.vertices[mesh.faces[count:]].mean(1),
+                         normalised(viewer.normals[mesh.faces[count:]].mean(1)))
+        more = nearest_points(centres, self.nodes.points).astype(np.int32)
+        nodes = Nodes(self.nodes.points, np.concatenate([self.nodes.of_face, more]))
+        return replace(self, scene=viewer.scene, nodes=nodes)
 
 
 def precompute_transfer(

@@ -96,6 +96,11 @@ class VertexShading:
         self._place(index, vertices, points, transfer)
         self._light(light, camera_from_head, moves, light_index, lamp)
 
+    @property
+    def index(self) -> np.ndarray:
+        """[P] int: the vertices that are shaded."""
+        return self._index
+
     def of_points(
         self, index: np.ndarray, vertices: np.ndarray, points: Points, transfer: Transfer, material: Material
     ) -> VertexShading:

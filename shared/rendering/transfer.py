@@ -49,6 +49,10 @@ class Points:
         """The points index [n] int."""
         return Points(self.positions[index], self.normals[index])
 
+    def followed_by(self, other: Points) -> Points:
+        """These points, then the other ones."""
+        return Points(np.concatenate([self.positions, other.positions]), np.concatenate([self.normals, other.normals]))
+
 
 @dataclass(frozen=True)
 class Nodes:
@@ -71,6 +75,12 @@ class Transfer:
     def take(self, index: np.ndarray | slice) -> Transfer:
         """The transfer of the points at index."""
         return Transfer(self.direct[index], self.bounce[index], self.blocked[index], self.visible[index])
+
+    def followed_by(self, other: Transfer) -> Transfer:
+        """That of these points, then of the other's, along the same directions and with the same nodes."""
+        pairs = zip((self.direct, self.bounce, self.blocked, self.visible),
+                    (other.direct, other.bounce, other.blocked, other.visible), strict=True)
+        return Transfer(*(np.concatenate(pair) for pair in pairs))
 
     def visibility(self, index: slice | np.ndarray = slice(None)) -> np.ndarray:
         """[P', J] bool: does the point see that direction (horizon included)?"""

@@ -56,6 +56,7 @@ def make_views(
     lamp: NearLamp | None = None,
     eyes: TurningEyes | None = None,
     lids: LidActions | None = None,
+    head_faces: int | None = None,
 ) -> ViewSet:
     """All of them, pixels wide. maps and progress as for HeadViews; envmap [H, 2 H, 3], camera_from_head [F, 4, 4] and
     moves of the clip; held_out: frames of the clip to re-render, with their cameras; lamp: of its light, where it
@@ -64,7 +65,7 @@ def make_views(
     around = [orbit_camera(mesh, *place, pixels) for place in NOVEL_VIEWS.values()]
     camera, front = orbit_camera(mesh, RELIT_YAW_DEG, 0.0, pixels), orbit_camera(mesh, 0.0, 0.0, pixels)
     cameras = [*around, camera, front, *held_out.values()]
-    views = HeadViews(mesh, maps, VIEW_SIZES, cameras, progress, eyes=eyes, lids=lids)
+    views = HeadViews(mesh, maps, VIEW_SIZES, cameras, progress, eyes=eyes, lids=lids, head_faces=head_faces)
     novel = views.render(clip_light(envmap, camera_from_head, moves), around)
     again = views.render(envmap, list(held_out.values()), moves, fade=False, lamp=lamp) if held_out else []
     covered = share_out(len(ROUGHNESSES), lambda k: views.visibility(front, ROUGHNESSES[k]))
@@ -135,7 +136,8 @@ class HeadViews:
     default. progress(items, label) wraps the trace. light_resolution: edge of the cubemap that lights are seen through;
     deep: see VertexShading; over 1 where cavities are exact; eyes: those of the mesh, None: they do not turn; lids:
     actions of the mesh with which they move as cameras say, None: they do not. Light on them stays what it is on open
-    ones.
+    ones. head_faces: so many of the mesh's faces are the head's, and those after them stand off it and cast no shadow
+    on it; None: all are.
     """
 
     def __init__(
@@ -150,18 +152,27 @@ class HeadViews:
         only: np.ndarray | None = None,
         eyes: TurningEyes | None = None,
         lids: LidActions | None = None,
+        head_faces: int | None = None,
     ):
         self.light_resolution, self.deep, self.eyes, self.lids = light_resolution, deep, eyes, lids
         self.viewer = SurfaceViewer.of(mesh)
         self.maps = SurfaceMaps(maps["diffuse_albedo"], maps["specular_intensity"], maps.get("alpha"))
         self.solid = self.viewer if self.maps.alpha is None else solid_viewer(mesh, self.maps.alpha)
-        self.precomputed = precompute_transfer(self.solid, sizes or Sizes())
+        head = self.viewer if head_faces is None else SurfaceViewer.of(_first_faces(mesh, head_faces))
+        self.precomputed = precompute_transfer(head, sizes or Sizes())
         seen = np.ones(len(mesh.vertices), bool) if not cameras else self._seen(cameras)
         self.index = np.nonzero(seen if only is None else seen & only)[0]
         self.points = mesh_points(mesh, self.index)
         wrap = progress or (lambda items, label: items)
-        self.transfer: Transfer = self.precomputed.trace(self.points, lambda items: wrap(items, "visibility"))
-        self.material = self._material(mesh, maps)
+        count = len(head.mesh.vertices)
+        on_head = np.nonzero(self.index < count)[0]
+        self.transfer: Transfer = self.precomputed.trace(
+            self.points.take(on_head), lambda items: wrap(items, "visibility"))
+        if len(on_head) < len(self.index):
+            standing = self.precomputed.with_standing(self.solid)
+            off_head = self.points.take(np.nonzero(self.index >= count)[0])
+            self.transfer = self.transfer.followed_by(standing.trace(off_head))
+        self.material = self._material(head.mesh, maps)
         # What stands in for a point deep in a cavity is the nearest one in the open. Seen from inside the mouth that
         # can be the outside of the cheek, unless orientation counts as well.
         self._surface_place = np.concatenate([mesh.vertices, ORIENTATION_MM * self.viewer.normals], axis=1)
@@ -183,15 +194,17 @@ class HeadViews:
         return normalised(camera_centres(camera.camera_from_head[None])[0] - positions)
 
     def _material(self, mesh: Mesh, maps: Mapping[str, np.ndarray]) -> Material:
-        """The maps at the nodes, for light that bounces, and the roughness at the traced points."""
-        uv = np.zeros((len(mesh.vertices), 2))
-        uv[mesh.faces.ravel()] = mesh.uvs[mesh.face_uvs.ravel()]
+        """The maps at the nodes, for light that bounces, and the roughness at the traced points; mesh: the head's."""
+        whole = self.viewer.mesh
+        uv = np.zeros((len(whole.vertices), 2))
+        uv[whole.faces.ravel()] = whole.uvs[whole.face_uvs.ravel()]
+        own = uv[: len(mesh.vertices)]
         nearest = cKDTree(mesh.vertices).query(self.precomputed.nodes.points.positions)[1]
         albedo = sample_bilinear(maps["diffuse_albedo"], uv[nearest])
-        specular = float(np.median(sample_bilinear(maps["specular_intensity"], uv)))
+        specular = float(np.median(sample_bilinear(maps["specular_intensity"], own)))
         roughness = sample_bilinear(maps["roughness"], uv).ravel()
-        varies = np.ptp(roughness) > 1e-3
-        return Material(albedo, specular, float(np.median(roughness)), roughness[self.index] if varies else None)
+        varies, usual = np.ptp(roughness) > 1e-3, float(np.median(roughness[: len(own)]))
+        return Material(albedo, specular, usual, roughness[self.index] if varies else None)
 
     def render(
         self,
@@ -299,6 +312,12 @@ class HeadViews:
         picture = np.full(face.shape, np.nan)
         picture[hit] = interpolate(share, self.viewer.mesh.faces, face[hit], bary[hit])
         return picture
+
+
+def _first_faces(mesh: Mesh, count: int) -> Mesh:
+    """Of a mesh whose first faces use the first vertices."""
+    faces = mesh.faces[:count]
+    return Mesh(mesh.vertices[: faces.max() + 1], faces, mesh.uvs, mesh.face_uvs[:count])
 
 
 def clip_light(envmap: np.ndarray, camera_from_head: np.ndarray, moves: str) -> np.ndarray:

@@ -78,7 +78,8 @@ class SolvedClip:
         head = self.asset.mesh.faces[: len(segment) - count]
         moving = facial_actions(load_head_model(), self.asset.mesh.vertices[: head.max() + 1], head, LID_ACTIONS)
         lids = LidActions.of(moving)
-        self.views = HeadViews(self.asset.mesh, self.asset.maps, SIZES, cameras, eyes=eyes, lids=lids)
+        self.views = HeadViews(self.asset.mesh, self.asset.maps, SIZES, cameras, eyes=eyes, lids=lids,
+                               head_faces=self.asset.head_faces)
 
     def compared(self) -> list[HeldOutFrame]:
         """Every held-out frame beside its re-render under the clip's light."""

@@ -179,6 +179,7 @@ def run(options: argparse.Namespace) -> list[Path]:
         deep=deep,
         eyes=asset.eyes,
         lids=asset.lids,
+        head_faces=asset.head_faces,
     )
     try:
         options.out.mkdir(parents=True, exist_ok=True)

@@ -38,7 +38,8 @@ class Asset:
     frame_index [F], intrinsics [3, 3] of the source frame, what moved in the clip, its light's lamp where that stands
     near; of an export with a gaze, the eyes, and how they turn in each frame, eye_turn [F, 2, 2] radians; of one whose
     lids move, the actions that move them, how far its eyes are shut, shut [F, 2], and how far they look up from where
-    they do with lids at rest, pitch [F, 2] radians."""
+    they do with lids at rest, pitch [F, 2] radians. head_faces: how many of the mesh's faces are the head's where hair
+    has some of its own; None: all."""
 
     mesh: Mesh
     maps: dict[str, np.ndarray]
@@ -53,6 +54,7 @@ class Asset:
     lids: LidActions | None = None
     shut: np.ndarray | None = None
     pitch: np.ndarray | None = None
+    head_faces: int | None = None
 
 
 def open_asset(path: Path, albedo: tuple[float, ...], specular: float, roughness: float) -> Asset:
@@ -103,6 +105,7 @@ def _open_result(path: Path) -> Asset:
         arrays["intrinsics"].astype(np.float64),
         *_light_of_clip(folder),
         **_eyes_of_clip(folder, head, mesh, arrays),
+        head_faces=None if hair is None else len(head.faces),
     )
 
 

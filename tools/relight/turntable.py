@@ -130,6 +130,7 @@ def _views(asset: Asset, progress: Progress) -> HeadViews:
         progress=lambda items, label: progress(items, label, len(items) if hasattr(items, "__len__") else None),
         light_resolution=round((_DIRECTIONS / 6) ** 0.5),
         eyes=asset.eyes,
+        head_faces=asset.head_faces,
     )
 
 

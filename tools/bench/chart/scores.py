@@ -90,7 +90,8 @@ def relit_shots(subject: Path, alignment: Similarity) -> list[ScoredShot]:
 def render_shots(asset: Asset, shots: list[ScoredShot], export: Path) -> None:
     """Writes the pictures; only what shows in face skin is shaded with care."""
     near = [_projects_into(asset.mesh.vertices, shot) for shot in shots]
-    views = HeadViews(asset.mesh, asset.maps, SIZES, [shot.camera for shot in shots], only=np.any(near, axis=0))
+    views = HeadViews(asset.mesh, asset.maps, SIZES, [shot.camera for shot in shots], only=np.any(near, axis=0),
+                      head_faces=asset.head_faces)
     for shot in shots:
         picture = views.render(shot.light, [shot.camera], shot.moves, fade=False)[0]
         path = export / shot.file
