@@ -17,6 +17,7 @@ from shared.hair.hair_pixels import CLOTH_PIXEL, HairPixels
 from shared.hair.hull import LEAST_MM, hull_radius
 from shared.hair.joined import HAIR_ROUGHNESS, HairSurface, joined_surface
 from shared.hair.shell_grid import ShellGrid
+from shared.hair.streaks import with_streaks
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer, sample_colours
 from shared.imaging.texels import TexelSurface
@@ -40,6 +41,8 @@ BENEATH = ("scalp", "ears", "forehead")
 """Segments that hair may press flat."""
 FACED = -0.1
 """Least cosine to some view of a vertex that is lit: those around what is seen are, too."""
+SEEN = 1.0
+"""Information on a texel's log albedo from which on its own streaks are known."""
 GAP_MM = 1.0
 """Between hair and what it presses flat."""
 
@@ -150,7 +153,8 @@ def texture_hair(hair: StandingHair, lit: HairyHead, views: Views, context: RunC
                           hidden=1.0 - share, matt=np.ones(len(share)), context=context)
     material, _ = texture.run((np.inf,))
     albedo = texels.dilated(texels.to_image(material.albedo.astype(np.float32)))
-    return HairSurface(hair.mesh, albedo, hair.alpha)
+    seen = texels.dilated(texels.to_image(material.information)) > SEEN
+    return HairSurface(hair.mesh, with_streaks(albedo, seen), hair.alpha)
 
 
 def _typical_albedo(lit: HairyHead, chosen: np.ndarray, views: Views) -> np.ndarray:
