@@ -57,7 +57,8 @@ EDGE_PX, EDGE_CONTRAST = 5, 1e-4
 class SeenPixels:
     """A frame before it is told apart: root [H, W, 3] of its radiance; person, mesh [H, W] bool; of the mesh there the
     share of each kind [H, W, 3], and whether hair may hang before it [H, W]; low [H, W]: how likely cloth is, 0 to 1,
-    by the height below the chin; middle [H, W]: how far a pixel is in the neck's width, 0 to 1."""
+    by the height below the chin; middle [H, W]: how far a pixel is in the neck's width, 0 to 1; hair, skin [H, W]: how
+    sure that is of the mesh there."""
 
     root: np.ndarray
     person: np.ndarray
@@ -66,6 +67,8 @@ class SeenPixels:
     open: np.ndarray
     low: np.ndarray
     middle: np.ndarray
+    hair: np.ndarray
+    skin: np.ndarray
 
 
 class HairPixels:
@@ -78,32 +81,17 @@ class HairPixels:
         chin = viewer.mesh.faces[surface.faces_of(("chin",))]
         self.chin_mm = float(viewer.mesh.vertices[chin, 1].min())
         self.neck_mm = float(np.abs(viewer.mesh.vertices[surface.vertices_of(("neck",)), 0]).max())
-        known = np.maximum(1.0 - materials[:, [UNKNOWN]], 1e-3)
-        other = [label for label in range(len(LABELS)) if label not in (UNKNOWN, HAIR, CLOTH)]
-        kinds = np.stack([materials[:, HAIR], materials[:, other].sum(1), materials[:, CLOTH]], 1) / known
-        back, front = FRONT_OF_NECK
-        around = normalised((viewer.mesh.vertices - centre) * [1.0, 0.0, 1.0])
-        aside = np.clip((front - around[:, [2]]) / (front - back), 0.0, 1.0)
-        before = np.where(surface.vertices_of(("ears",))[:, None], 1.0, aside * surface.vertices_of(("neck",))[:, None])
-        sure = np.where(known > 0.5, kinds, 0.0)
-        open_to = np.where(surface.vertices_of(("scalp",))[:, None], GROWN, BARE)
-        kinds = known * kinds + (1.0 - known) * open_to
-        throat = np.where(surface.vertices_of(("neck",)), 1.0 - aside[:, 0], 0.0)
-        shaded = (1.0 - THROAT) * throat * kinds[:, HAIR_PIXEL]
-        kinds[:, HAIR_PIXEL] -= shaded
-        kinds[:, SKIN_PIXEL] += shaded
-        self._vertices = np.concatenate([kinds, before, sure[:, [HAIR_PIXEL]], materials[:, [SKIN]] / known], 1)
-        self._vertices = self._vertices.astype(np.float32)
+        self._vertices = _shown_by_vertices(viewer, surface, materials, centre)
         self.colours = np.full((len(KINDS), *(BINS,) * 3), 1.0 / BINS**3)
 
     def learn(self, frames: Sequence[int]) -> None:
         """The clip's colours of each kind, by some of the frames."""
         counts = np.zeros((len(KINDS), *(BINS,) * 3))
         for f in frames[:: max(1, len(frames) // LEARNT_FRAMES)]:
-            seen, sure = self._seen(f)
+            seen = self._seen(f)
             inside = _eroded(seen.mesh) & seen.person
             beside = seen.person & ~_dilated(seen.mesh)
-            shows = ((inside & (sure[..., 0] > SURE)) | (beside & (seen.low == 0.0)), inside & (sure[..., 1] > SURE),
+            shows = ((inside & (seen.hair > SURE)) | (beside & (seen.low == 0.0)), inside & (seen.skin > SURE),
                      beside & (seen.low > 0.99))
             for kind, where in enumerate(shows):
                 counts[kind] += _histogram(seen.root[where][::EVERY])
@@ -120,7 +108,7 @@ class HairPixels:
     def probabilities(self, f: int) -> tuple[np.ndarray, np.ndarray]:
         """[H, W, 3] float32: probability of hair, skin and cloth in frame f, 0 of all beside the person; and [H, W]
         bool: where the mesh is."""
-        seen, _ = self._seen(f)
+        seen = self._seen(f)
         bins = np.minimum((seen.root * BINS).astype(int), BINS - 1)
         likelihood = np.moveaxis(self.colours[:, bins[..., 0], bins[..., 1], bins[..., 2]], 0, -1) + UNSEEN
         above, below, between, before = (np.array(shares, np.float32) for shares in (ABOVE, BELOW, BETWEEN, BEFORE))
@@ -137,8 +125,7 @@ class HairPixels:
         raised = np.exp(np.stack(smooth, -1))
         return raised / raised.sum(-1, keepdims=True) * seen.person[..., None], seen.mesh
 
-    def _seen(self, f: int) -> tuple[SeenPixels, np.ndarray]:
-        """Frame f, and how sure hair and skin are where the mesh is [H, W, 2]."""
+    def _seen(self, f: int) -> SeenPixels:
         views, mesh = self.views, self.viewer.mesh
         pose, lens = views.camera_from_head[f], views.intrinsics[f]
         root = np.sqrt(np.clip(views.picture(f).levels[0], 0.0, 1.0))
@@ -155,7 +142,28 @@ class HairPixels:
         start, end = CLOTH_BELOW_MM
         low = np.clip((self.chin_mm - up - start) / (end - start), 0.0, 1.0).astype(np.float32)
         person = _largest_part(views.mask(f) > 0)
-        return SeenPixels(root, person, hit, values[..., :3], values[..., 3], low, middle), values[..., 4:]
+        kinds, (before, hair, skin) = values[..., :3], np.moveaxis(values[..., 3:], -1, 0)
+        return SeenPixels(root, person, hit, kinds, before, low, middle, hair, skin)
+
+
+def _shown_by_vertices(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray, centre: np.ndarray
+                       ) -> np.ndarray:
+    """[V, 6] float32 of the mesh's vertices: share of each kind, what is not known filled in by the topology and the
+    throat's shade not taken for hair; whether hair may hang before it; how sure hair is, and skin."""
+    known = np.maximum(1.0 - materials[:, [UNKNOWN]], 1e-3)
+    other = [label for label in range(len(LABELS)) if label not in (UNKNOWN, HAIR, CLOTH)]
+    told = np.stack([materials[:, HAIR], materials[:, other].sum(1), materials[:, CLOTH]], 1) / known
+    ears, neck, scalp = (surface.vertices_of((name,)) for name in ("ears", "neck", "scalp"))
+    back, front = FRONT_OF_NECK
+    around = normalised((viewer.mesh.vertices - centre) * [1.0, 0.0, 1.0])
+    aside = np.clip((front - around[:, 2]) / (front - back), 0.0, 1.0)
+    kinds = known * told + (1.0 - known) * np.where(scalp[:, None], GROWN, BARE)
+    shaded = (1.0 - THROAT) * np.where(neck, 1.0 - aside, 0.0) * kinds[:, HAIR_PIXEL]
+    kinds[:, HAIR_PIXEL] -= shaded
+    kinds[:, SKIN_PIXEL] += shaded
+    before = np.where(ears, 1.0, aside * neck)
+    hair = np.where(known[:, 0] > 0.5, told[:, HAIR_PIXEL], 0.0)
+    return np.column_stack([kinds, before, hair, materials[:, SKIN] / known[:, 0]]).astype(np.float32)
 
 
 def _histogram(colours: np.ndarray) -> np.ndarray:
