@@ -33,7 +33,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from shared.contract import Job, Output, Parameter, ParameterGroup, Stage, main
-from shared.contract.records import MESH, SELECTION_TIMES, SOLVE, SOLVED_POSES
+from shared.contract.records import MESH, SELECTION_TIMES, SOLVE, SOLVED_POSES, TRIANGLES
 from shared.errors import InputError, LimnError
 
 SOLVERS = ("transfer", "reference")
@@ -81,7 +81,7 @@ STAGE = Stage(
         Output("envmap_far.exr", "the same without the main lamp, where that stands near", space="world",
                colour_space="lin_rec709_scene", optional=True),
         Output("hair.npz", "hair's surface, where it stands off the head, with UVs of maps/hair_*.exr", unit="mm",
-               space="head", fields=MESH, optional=True),
+               space="head", fields=TRIANGLES, optional=True),
         Output("mesh.npz", "the refined mesh, with its face segments", unit="mm", space="head", fields=MESH),
         Output("shape.png", "tracked and refined mesh, normals and difference, from three sides", colour_space="srgb"),
         Output("poses.npz", "the head's pose in each frame, and the lens", unit="mm", fields=SOLVED_POSES),

@@ -84,11 +84,14 @@ TRACKED_POSES = (
     GAZE,
     Field("gaze_sigma", "Its standard deviation.", "float64", "F, 2, 2", "rad", optional=True),
 )
-MESH = (
+TRIANGLES = (
     Field("vertices", "Positions in head space.", "float64", "V, 3", "mm"),
     Field("faces", "Triangles, as rows of `vertices`.", "int32", "faces, 3"),
     Field("uvs", "Texture coordinates, v up.", "float64", "T, 2"),
     Field("face_uvs", "Triangles, as rows of `uvs`.", "int32", "faces, 3"),
+)
+MESH = (
+    *TRIANGLES,
     Field("face_segment", "Segment of each triangle: a position in `segments` of tracking.json. Absent where a mesh "
           "without segments was given.", "uint8", "faces", optional=True),
 )

@@ -91,6 +91,8 @@ ELSEWHERE = {
     "test_fit_appearance": {"iterations[].undone"},
     "test_refine_shape": {"solve.json: shape.fitted"},
     "test_lamp_distance": {"solve.json: lamp", "run.json: lamp"},
+    "test_joined": {"hair.npz: "},
+    "test_hair_surface": {"solve.json: hair", "run.json: hair"},
     "test_export_eyes": {"poses.npz: gaze", "poses.npz: eye_turn"},
 }
 """Tests that compare what the tiny run has no occasion to write."""

@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
+from field_check import field_faults
 from shapes import sphere
 
+from shared.contract.records import TRIANGLES
 from shared.geometry.surface import Surface
 from shared.hair.hair_files import read_hair, write_hair
 from shared.hair.joined import HAIR_SEGMENT, HairSurface, joined_maps, joined_mesh, joined_surface
 from shared.imaging.texture import sample_bilinear
+from shared.io.arrays import load_arrays
 from shared.io.meshes import write_obj
 
 HEAD, HAIR = sphere(80.0, 2), sphere(95.0, 1)
@@ -49,6 +52,7 @@ def test_files_hold_what_was_written(hair, tmp_path):
     assert read_hair(tmp_path) is None
     write_hair(tmp_path, hair)
     found = read_hair(tmp_path)
+    assert field_faults(load_arrays(tmp_path / "hair.npz"), TRIANGLES) == []
     assert np.array_equal(found.mesh.vertices, HAIR.vertices) and np.array_equal(found.mesh.face_uvs, HAIR.face_uvs)
     assert np.allclose(found.albedo, hair.albedo) and np.allclose(found.alpha, hair.alpha)
     (tmp_path / "hair.npz").unlink()

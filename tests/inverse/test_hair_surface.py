@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from field_check import below, field_faults
 from toy_hair import HAIR_MM, HAIRLINE_MM, HEAD_MM, hairy_ball
 
+from shared.contract.records import RUN, SOLVE
 from shared.geometry.mesh import face_normals
 from shared.geometry.raycast import RayScene
 from shared.imaging.image_sampling import SurfaceViewer
@@ -24,6 +26,11 @@ def test_hair_lies_where_its_outline_is(found):
     radius = np.linalg.norm(hair.mesh.vertices, axis=1)
     assert np.median(np.abs(radius[crown] - HAIR_MM)) < 2.0
     assert hair.share[hair.mesh.vertices[:, 1] > 60.0].min() > 0.9
+
+
+def test_the_record_is_as_declared(found):
+    assert field_faults(found[1].record, below(SOLVE, "hair")) == []
+    assert below(SOLVE, "hair") == below(RUN, "hair")
 
 
 def test_the_face_is_left_free(found):
