@@ -1,21 +1,24 @@
-"""Streaks where no frame looks: what is seen beside, mirrored at its border.
+"""Streaks where no frame looks: drawn, as strong and as fine as those that frames show, down the rows of hair's map.
 
-The albedo that no frame shows is smooth, and would look like cloth. Of what is seen the part finer than that goes on
-beyond the border as in a mirror, again and again: strands keep their direction, strength and colour.
+The albedo that no frame shows is smooth, and would look like cloth. What is seen was tried in its place, mirrored at
+its border: it is recognised, and its ragged border draws blocks.
 """
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import gaussian_filter
 
-SMOOTH = 1.0 / 40.0
+SMOOTH = 1.0 / 60.0
 """Standard deviation, share of the map's edge, of what counts as smooth."""
 BORDER = 1.0 / 100.0
 """Share of the map's edge from the border of what is seen that is not trusted: there hair turns away."""
-REFLECTIONS = 6
-DARKEST = 1e-3
+LENGTH = 1.0 / 12.0
+"""Of a streak: standard deviation, share of the map's edge."""
+FINEST, COARSEST = 0.7, 8.0
+"""Standard deviation of its width, texels."""
+SEED, DARKEST = 20, 1e-3
 
 
 def with_streaks(albedo: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -23,28 +26,25 @@ def with_streaks(albedo: np.ndarray, seen: np.ndarray) -> np.ndarray:
     with streaks where it is not seen. Nothing changes where nothing is seen, or everything."""
     size = len(albedo)
     reach = max(1, round(BORDER * size))
-    trusted = cv2.erode(np.pad(seen, ((0, 0), (size, size)), mode="wrap").astype(np.uint8),
-                        np.ones((2 * reach + 1,) * 2, np.uint8))[:, size:-size].astype(bool)
+    wide = np.pad(seen, ((0, 0), (size, size)), mode="wrap").astype(np.uint8)
+    trusted = cv2.erode(wide, np.ones((2 * reach + 1,) * 2, np.uint8))[:, size:-size].astype(bool)
     if not trusted.any() or seen.all():
         return albedo.astype(np.float32)
-    logs = np.log(np.maximum(albedo, DARKEST)).astype(np.float32)
-    weight = trusted[..., None].astype(np.float32)
-    fine = (logs - _blurred(logs * weight, size) / np.maximum(_blurred(weight, size), 1e-3)) * weight
-    wide = np.pad(~trusted, ((0, 0), (size, size)), mode="wrap")
-    rows, columns = distance_transform_edt(wide, return_distances=False, return_indices=True)
-    rows, columns = rows[:, size:-size], columns[:, size:-size] - size
-    row, column = np.indices(trusted.shape)
-    for _ in range(REFLECTIONS):
-        at = np.clip(row, 0, size - 1), column % size
-        out = ~trusted[at]
-        nearest = rows[at], columns[at] + (column - at[1])
-        row, column = np.where(out, 2 * nearest[0] - at[0], row), np.where(out, 2 * nearest[1] - column, column)
-    mirrored = fine[np.clip(row, 0, size - 1), column % size]
-    added = np.where(seen[..., None], 0.0, mirrored)
-    return np.exp(logs + added).astype(np.float32)
+    logs = np.log(np.maximum(albedo, DARKEST)).mean(-1)
+    weight = trusted.astype(np.float64)
+    fine = logs - _blurred(logs * weight, SMOOTH * size) / np.maximum(_blurred(weight, SMOOTH * size), 1e-3)
+    pairs = trusted & np.roll(trusted, -1, axis=1)
+    power, steps = np.mean(fine[trusted] ** 2), np.mean((np.roll(fine, -1, axis=1) - fine)[pairs] ** 2)
+    # A field smoothed over s texels differs from one to the next by 2 (1 - exp(-1 / 4 s^2)) of its variance.
+    alike = np.clip(1.0 - 0.5 * steps / max(power, 1e-12), 1e-3, 1.0 - 1e-3)
+    width = float(np.clip(np.sqrt(-0.25 / np.log(alike)), FINEST, COARSEST))
+    drawn = gaussian_filter(np.random.default_rng(SEED).normal(size=seen.shape), (LENGTH * size, width),
+                            mode=("nearest", "wrap"))
+    drawn *= np.sqrt(power) / drawn.std()
+    unseen = np.clip(1.0 - _blurred(seen.astype(np.float64), reach), 0.0, 1.0) * ~seen
+    return (albedo * np.exp(unseen * drawn)[..., None]).astype(np.float32)
 
 
-def _blurred(image: np.ndarray, size: int) -> np.ndarray:
-    """[S, S, C] -> the same, smooth across the left and right border, too."""
-    wide = np.pad(image, ((0, 0), (size, size), (0, 0)), mode="wrap")
-    return cv2.GaussianBlur(wide, (0, 0), SMOOTH * size).reshape(wide.shape)[:, size:-size]
+def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:
+    """[S, S] by a standard deviation in texels, across the left and right border, too."""
+    return gaussian_filter(image, sigma, mode=("nearest", "wrap"))
