@@ -22,8 +22,8 @@ SEED, DARKEST = 20, 1e-3
 
 
 def with_streaks(albedo: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """albedo [S, S, 3] of a map whose left and right border are one, seen [S, S] bool by frames -> float32 [S, S, 3],
-    with streaks where it is not seen. Nothing changes where nothing is seen, or everything."""
+    """albedo [S, S, 3], at most 1, of a map whose left and right border are one, seen [S, S] bool by frames -> float32
+    [S, S, 3], with streaks where it is not seen. Nothing changes where nothing is seen, or everything."""
     size = len(albedo)
     reach = max(1, round(BORDER * size))
     wide = np.pad(seen, ((0, 0), (size, size)), mode="wrap").astype(np.uint8)
@@ -42,7 +42,7 @@ def with_streaks(albedo: np.ndarray, seen: np.ndarray) -> np.ndarray:
                             mode=("nearest", "wrap"))
     drawn *= np.sqrt(power) / drawn.std()
     unseen = np.clip(1.0 - _blurred(seen.astype(np.float64), reach), 0.0, 1.0) * ~seen
-    return (albedo * np.exp(unseen * drawn)[..., None]).astype(np.float32)
+    return np.minimum(albedo * np.exp(unseen * drawn)[..., None], 1.0).astype(np.float32)
 
 
 def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:

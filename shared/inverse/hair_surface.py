@@ -152,7 +152,7 @@ def texture_hair(hair: StandingHair, lit: HairyHead, views: Views, context: RunC
     texture = TexturePass(texels, lit.viewer, lit.shading, views, specular=0.0, typical_albedo=typical,
                           hidden=1.0 - share, matt=np.ones(len(share)), context=context)
     material, _ = texture.run((np.inf,))
-    albedo = texels.dilated(texels.to_image(material.albedo.astype(np.float32)))
+    albedo = texels.dilated(texels.to_image(np.minimum(material.albedo, 1.0).astype(np.float32)))
     seen = texels.dilated(texels.to_image(material.information)) > SEEN
     return HairSurface(hair.mesh, with_streaks(albedo, seen), hair.alpha)
 

@@ -29,6 +29,14 @@ def test_smooth_colours_stay():
     assert np.abs(with_streaks(ramp, seen) / ramp - 1.0).max() < 0.03
 
 
+def test_no_albedo_gets_larger_than_one():
+    """White hair whose strands differ a lot."""
+    seen = np.zeros((SIZE, SIZE), bool)
+    seen[:, 40:120] = True
+    white = np.minimum(4.0 * STRANDS, 1.0)
+    assert with_streaks(np.where(seen[..., None], white, 0.95), seen).max() <= 1.0
+
+
 def test_without_a_look_nothing_changes():
     albedo = STRANDS.astype(np.float32)
     assert np.array_equal(with_streaks(albedo, np.zeros((SIZE, SIZE), bool)), albedo)
