@@ -41,6 +41,8 @@ BEFORE = (0.45, 0.45, 0.1)
 """The same before ears and neck, as far as their own materials are not believed."""
 BARE, GROWN = (0.08, 0.8, 0.12), (0.8, 0.18, 0.02)
 """The same of what the materials leave open, and where that is scalp."""
+BEARD, BESIDE_CHIN = (0.1, 0.3), ("jaw", "cheek_left", "cheek_right")
+"""Share of hair on the chin up to which there is no beard, and from which on there is one; what it grows on, too."""
 BELIEVED = 0.3
 THROAT = 0.1
 """How far the materials are believed that the throat is hair: in the chin's shade skin looks like it."""
@@ -58,7 +60,7 @@ class SeenPixels:
     """A frame before it is told apart: root [H, W, 3] of its radiance; person, mesh [H, W] bool; of the mesh there the
     share of each kind [H, W, 3], and whether hair may hang before it [H, W]; low [H, W]: how likely cloth is, 0 to 1,
     by the height below the chin; middle [H, W]: how far a pixel is in the neck's width, 0 to 1; hair, skin [H, W]: how
-    sure that is of the mesh there."""
+    sure that is of the mesh there; beard [H, W]: how much of the hair there grows on the face."""
 
     root: np.ndarray
     person: np.ndarray
@@ -69,6 +71,7 @@ class SeenPixels:
     middle: np.ndarray
     hair: np.ndarray
     skin: np.ndarray
+    beard: np.ndarray
 
 
 class HairPixels:
@@ -123,7 +126,11 @@ class HairPixels:
         smooth = [cv2.ximgproc.guidedFilter(guide, np.ascontiguousarray(told[..., k]), EDGE_PX, EDGE_CONTRAST)
                   for k in KINDS]
         raised = np.exp(np.stack(smooth, -1))
-        return raised / raised.sum(-1, keepdims=True) * seen.person[..., None], seen.mesh
+        found = raised / raised.sum(-1, keepdims=True) * seen.person[..., None]
+        grown = seen.beard * found[..., HAIR_PIXEL]  # as the head's own surface has it
+        found[..., HAIR_PIXEL] -= grown
+        found[..., SKIN_PIXEL] += grown
+        return found, seen.mesh
 
     def _seen(self, f: int) -> SeenPixels:
         views, mesh = self.views, self.viewer.mesh
@@ -142,14 +149,15 @@ class HairPixels:
         start, end = CLOTH_BELOW_MM
         low = np.clip((self.chin_mm - up - start) / (end - start), 0.0, 1.0).astype(np.float32)
         person = _largest_part(views.mask(f) > 0)
-        kinds, (before, hair, skin) = values[..., :3], np.moveaxis(values[..., 3:], -1, 0)
-        return SeenPixels(root, person, hit, kinds, before, low, middle, hair, skin)
+        kinds, (before, hair, skin, beard) = values[..., :3], np.moveaxis(values[..., 3:], -1, 0)
+        return SeenPixels(root, person, hit, kinds, before, low, middle, hair, skin, beard)
 
 
 def _shown_by_vertices(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray, centre: np.ndarray
                        ) -> np.ndarray:
-    """[V, 6] float32 of the mesh's vertices: share of each kind, what is not known filled in by the topology and the
-    throat's shade not taken for hair; whether hair may hang before it; how sure hair is, and skin."""
+    """[V, 7] float32 of the mesh's vertices: share of each kind, what is not known filled in by the topology and the
+    throat's shade not taken for hair; whether hair may hang before it; how sure hair is, and skin; and how much of the
+    hair there is beard: all of it on chin and lip, and, of a chin with a beard, on jaw, cheeks and throat."""
     known = np.maximum(1.0 - materials[:, [UNKNOWN]], 1e-3)
     other = [label for label in range(len(LABELS)) if label not in (UNKNOWN, HAIR, CLOTH)]
     told = np.stack([materials[:, HAIR], materials[:, other].sum(1), materials[:, CLOTH]], 1) / known
@@ -163,7 +171,12 @@ def _shown_by_vertices(viewer: SurfaceViewer, surface: Surface, materials: np.nd
     kinds[:, SKIN_PIXEL] += shaded
     before = np.where(ears, 1.0, aside * neck)
     hair = np.where(known[:, 0] > 0.5, told[:, HAIR_PIXEL], 0.0)
-    return np.column_stack([kinds, before, hair, materials[:, SKIN] / known[:, 0]]).astype(np.float32)
+    chin, lip, beside = (surface.vertices_of(names) for names in (("chin",), ("upper_lip_skin", "lips"), BESIDE_CHIN))
+    least, most = BEARD
+    of_chin = float((known[chin, 0] * told[chin, HAIR_PIXEL]).sum() / max(known[chin].sum(), 1e-6))
+    bearded = np.clip((of_chin - least) / (most - least), 0.0, 1.0)
+    beard = np.where(chin | lip, 1.0, bearded * np.maximum(beside, neck * (1.0 - aside)))
+    return np.column_stack([kinds, before, hair, materials[:, SKIN] / known[:, 0], beard]).astype(np.float32)
 
 
 def _histogram(colours: np.ndarray) -> np.ndarray:

@@ -36,6 +36,17 @@ def test_the_middle_of_the_face_is_skin(told):
     assert found[len(found) // 2, 90:120, 90:110, SKIN_PIXEL].min() > 0.9
 
 
+def test_a_beard_is_the_heads_own():
+    """A chin whose vertices are hair, drawn in the colour of hair: no hair that stands off."""
+    surface, views, materials, _ = hairy_ball(haired=True, bearded=True)
+    pixels = HairPixels(SurfaceViewer.of(surface.mesh), surface, materials, views, np.zeros(3))
+    pixels.learn(range(len(views)))
+    found = pixels.probabilities(len(views) // 2)[0]
+    chin = found[131:137, 95:105]
+    assert chin[..., HAIR_PIXEL].max() < 0.1 and chin[..., SKIN_PIXEL].min() > 0.5
+    assert found[60:64, 95:105, HAIR_PIXEL].min() > 0.9
+
+
 def test_beside_the_person_there_is_nothing(told):
     found, _ = told
     assert (found[:, :20, :20] == 0.0).all()

@@ -35,7 +35,7 @@ def is_hair(places):
     return (places[:, 1] > HAIRLINE_MM) | (places[:, 2] < 30.0)
 
 
-def drawn(surface, pose, haired):
+def drawn(surface, pose, haired, bearded):
     """Codes [H, W, 3], mask [H, W] and which pixels are hair [H, W] of a frame: a shirt and a neck below, the ball
     before them."""
     codes, mask = np.full((*SIZE[::-1], 3), WALL_CODE, np.uint8), np.zeros(SIZE[::-1], np.uint8)
@@ -51,15 +51,17 @@ def drawn(surface, pose, haired):
                 continue
             hit[hit] = is_hair((rays[hit] * depth[hit][:, None] - pose[:3, 3]) @ pose[:3, :3])
         codes[hit], mask[hit] = code, 128
+        if code == SKIN_CODE and bearded:
+            codes[hit & np.isin(face, np.nonzero(surface.faces_of(("chin",)))[0])] = HAIR_CODE
         hair[hit] = code == HAIR_CODE
     return codes, mask, hair
 
 
-def hairy_ball(haired):
+def hairy_ball(haired, bearded=False):
     """Its Surface, Views, the materials of its vertices [V, len(LABELS)], and which pixels are hair [F, H, W]."""
     surface = toy_surface()
     poses = nods(np.linspace(-50.0, 50.0, 9))
-    frames = [drawn(surface, pose, haired) for pose in poses]
+    frames = [drawn(surface, pose, haired, bearded) for pose in poses]
 
     def read_picture(f):
         codes, mask, _ = frames[f]
@@ -70,4 +72,7 @@ def hairy_ball(haired):
     scalp = surface.vertices_of(("scalp",))
     materials[scalp, HAIR if haired else SKIN] = 1.0
     materials[~scalp, SKIN] = 1.0
+    if bearded:
+        chin = surface.vertices_of(("chin",))
+        materials[chin] = np.eye(len(LABELS))[HAIR]
     return surface, views, materials, np.stack([frame[2] for frame in frames])
