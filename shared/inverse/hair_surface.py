@@ -79,7 +79,7 @@ class HairyHead:
 
 def find_hair(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray, views: Views, size: int,
               context: RunContext = SILENT) -> StandingHair | None:
-    """None where it covers too little of the skull to be told from a scalp.
+    """None where it covers too little of the skull to be told from a scalp, or no frame shows where it ends.
 
     viewer: of the solved head, surface: with its segments; materials [V, len(LABELS)]; size: edge of hair's map.
     """
@@ -110,10 +110,12 @@ def find_hair(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray, vi
     seen = look_for_hair(grid, shell, kinds, views, share)  # past what is before the face
     share = covered(grid, shell, seen)
     alpha = shell.dilated(shell.to_image(alpha_of(shell, seen, share)))
-    head = _pressed(viewer.mesh, surface, grid, radius, grid.of_grid(share))
-    kept = (share > LEAST_SHARE)[shell.mesh.faces].any(1)
-    mesh, used = _part(shell.mesh, kept)
     thick = (radius - grid.base)[(grid.of_grid(share) > 0.5) & (said > 0.0)]
+    if not len(thick):
+        context.note("hair: no outline tells how far out it reaches: no surface of its own")
+        return None
+    head = _pressed(viewer.mesh, surface, grid, radius, grid.of_grid(share))
+    mesh, used = _part(shell.mesh, (share > LEAST_SHARE)[shell.mesh.faces].any(1))
     record = {"thickness_mm": round(float(np.median(thick)), 1), "skull_covered": round(dome, 3),
               "seen_share": round(float((seen.looks > 0).mean()), 3),
               "lowest_mm": round(float(mesh.vertices[:, 1].min() - pixels.chin_mm), 1)}

@@ -5,6 +5,7 @@ import pytest
 from field_check import below, field_faults
 from toy_hair import HAIR_MM, HAIRLINE_MM, HEAD_MM, hairy_ball
 
+from shared.compute.run_context import RunContext
 from shared.contract.records import RUN, SOLVE
 from shared.geometry.mesh import face_normals
 from shared.geometry.raycast import RayScene
@@ -64,3 +65,16 @@ def test_what_hair_covers_lies_beneath(found):
 def test_a_bare_head_has_no_hair():
     surface, views, materials, _ = hairy_ball(haired=False)
     assert find_hair(SurfaceViewer.of(surface.mesh), surface, materials, views, 64) is None
+
+
+def test_hair_whose_end_no_frame_shows_has_no_surface(monkeypatch):
+    """Outlines that say nothing, as where the head fills the picture."""
+    def silent(grid, *_):
+        return grid.base + 8.0, np.zeros(grid.base.shape)
+
+    monkeypatch.setattr("shared.inverse.hair_surface.hull_radius", silent)
+    surface, views, materials, _ = hairy_ball(haired=True)
+    notes = []
+    context = RunContext(lambda items, label: items, notes.append)
+    assert find_hair(SurfaceViewer.of(surface.mesh), surface, materials, views, 64, context) is None
+    assert len(notes) == 1 and "no outline tells" in notes[0]
