@@ -435,9 +435,10 @@ def run(job: Job) -> None:
     capture = describe_capture(job, poses, frames, actions)
     asset = describe_asset(job, mesh, eyes, actions, details, base, strands, capture, frames, writer, lamp)
     write_assets(job, asset, eyeballs, poses, maps, far)
-    seen = (mesh, maps) if hair is None else (joined_mesh(mesh, hair.mesh), joined_maps(maps, hair))
-    head_faces = None if hair is None else len(mesh.faces)
-    views = render_views(job, writer, *seen, eyes, actions, envmap, poses, frames, solve, head_faces)
+    seen_mesh, seen_maps, head_faces = mesh, maps, None
+    if hair is not None:
+        seen_mesh, seen_maps, head_faces = joined_mesh(mesh, hair.mesh), joined_maps(maps, hair), len(mesh.faces)
+    views = render_views(job, writer, seen_mesh, seen_maps, eyes, actions, envmap, poses, frames, solve, head_faces)
     record = run_record(job, mesh, said_of_them, solve, time.perf_counter() - start)
     write_json(job.out / "run.json", record)
     methods = method_records(job, record, solve)

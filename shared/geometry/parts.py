@@ -53,10 +53,16 @@ def hair_part(hair: Mesh) -> RigidPart:
 
 
 def _part(mesh: Mesh, normals: np.ndarray, name: str, faces: np.ndarray, pivot: np.ndarray) -> RigidPart:
-    used, corners = _by_first_use(mesh.faces[faces])
-    used_uvs, uv_corners = _by_first_use(mesh.face_uvs[faces])
-    part = Mesh(mesh.vertices[used] - pivot, corners, mesh.uvs[used_uvs], uv_corners)
-    return RigidPart(name, part, normals[used], pivot, used)
+    part, used = mesh_part(mesh, faces)
+    return RigidPart(name, part.replace(vertices=part.vertices - pivot), normals[used], pivot, used)
+
+
+def mesh_part(whole: Mesh, kept: np.ndarray) -> tuple[Mesh, np.ndarray]:
+    """The faces kept, [F] bool or their numbers [n] int, as a mesh of their own, and which vertices of the whole it has
+    [m] int."""
+    used, corners = _by_first_use(whole.faces[kept])
+    used_uvs, uv_corners = _by_first_use(whole.face_uvs[kept])
+    return Mesh(whole.vertices[used], corners, whole.uvs[used_uvs], uv_corners), used
 
 
 def quad_part(whole: QuadMesh, kept: np.ndarray) -> tuple[QuadMesh, np.ndarray]:

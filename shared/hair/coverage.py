@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from shared.geometry.mesh import diffused, mesh_edges
 from shared.geometry.raycast import RayScene
+from shared.hair.hair_pixels import HAIR_PIXEL
 from shared.hair.shell_grid import ShellGrid
 from shared.imaging.image_sampling import Picture, SurfaceViewer
 from shared.imaging.texels import TexelSurface
@@ -38,6 +39,7 @@ LEAST_SHARE = 0.02
 LEAST_COSINE = 0.05
 """Of a look that tells where hair ends: at its border it curves away."""
 BORDER_STEPS = 2
+"""Edges beyond what is connected to the crown over which alpha may still run out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +68,11 @@ def look_for_hair(grid: ShellGrid, texels: TexelSurface, kinds: Mapping[int, np.
         picture = Picture((shares,), np.zeros(shares.shape, np.int8), np.ones(shares.shape[:2], np.float32))
         view = viewer.view(views.camera_from_head[f], lens, shares.shape[1::-1])
         samples, _ = texels.samples(texels.frame_view(view, picture, lens))
-        share, weight = np.clip(samples.colours, 0.0, 1.0), samples.weight
-        person = share.sum(1).clip(max=1.0)
+        shown, weight = np.clip(samples.colours, 0.0, 1.0), samples.weight
+        person = shown.sum(1).clip(max=1.0)
         facing = hangs[samples.rows] * np.clip((weight - BESIDE[0]) / (BESIDE[1] - BESIDE[0]), 0.0, 1.0)
         beside = (1.0 - person) * facing
-        told = person * np.log(np.maximum(share[:, 0] / np.maximum(person, 1e-6), LEAST_SHARE))
+        told = person * np.log(np.maximum(shown[:, HAIR_PIXEL] / np.maximum(person, 1e-6), LEAST_SHARE))
         looks[samples.rows] += weight * (person + beside)
         hair[samples.rows] += weight * (told + beside * np.log(LEAST_SHARE))
     return SeenHair(looks, hair / np.maximum(looks, 1e-9))

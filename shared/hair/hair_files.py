@@ -7,18 +7,19 @@ from pathlib import Path
 import numpy as np
 
 from shared.hair.joined import HairSurface
+from shared.io.export_maps import HAIR_ALBEDO, HAIR_ALPHA, HAIR_MAPS, map_path
 from shared.io.exr_picture import read_rec709
 from shared.io.images import write_exr
 from shared.io.meshes import load_mesh, read_obj, save_mesh
 
-MESH, OBJ, ALBEDO, ALPHA = "hair.npz", "hair.obj", "hair_albedo", "hair_alpha"
+MESH, OBJ = "hair.npz", "hair.obj"
 
 
 def write_hair(folder: Path, hair: HairSurface) -> None:
     """hair.npz and the maps, as inverse_render leaves them; folder has maps/ already."""
     save_mesh(folder / MESH, hair.mesh)
-    write_exr(folder / "maps" / f"{ALBEDO}.exr", hair.albedo, colour_space="lin_rec709_scene")
-    write_exr(folder / "maps" / f"{ALPHA}.exr", hair.alpha, colour_space="data")
+    write_exr(folder / "maps" / f"{HAIR_ALBEDO}.exr", hair.albedo, colour_space="lin_rec709_scene")
+    write_exr(folder / "maps" / f"{HAIR_ALPHA}.exr", hair.alpha, colour_space="data")
 
 
 def read_hair(folder: Path) -> HairSurface | None:
@@ -30,11 +31,5 @@ def read_hair(folder: Path) -> HairSurface | None:
         mesh = read_obj(folder / OBJ)
     else:
         return None
-    albedo, alpha = (_read_map(folder / "maps", name) for name in (ALBEDO, ALPHA))
+    albedo, alpha = (read_rec709(folder / map_path(folder, name)) for name in HAIR_MAPS)
     return HairSurface(mesh, albedo, np.clip(alpha, 0.0, 1.0))
-
-
-def _read_map(folder: Path, name: str) -> np.ndarray:
-    """NAME.exr, or the only tile of a UDIM set, linear Rec.709 or data."""
-    path = folder / f"{name}.exr"
-    return read_rec709(path if path.is_file() else folder / f"{name}.1001.exr")

@@ -46,7 +46,12 @@ def joined_maps(maps: Mapping[str, np.ndarray], hair: HairSurface) -> dict[str, 
     beside = {"diffuse_albedo": hair.albedo, "specular_intensity": np.zeros_like(hair.alpha),
               "roughness": np.full_like(hair.alpha, HAIR_ROUGHNESS)}
     found = {name: np.concatenate([image, beside[name]], axis=1) for name, image in flat.items()}
-    return found | {"alpha": np.concatenate([np.ones_like(hair.alpha), hair.alpha], axis=1)}
+    return found | {"alpha": joined_alpha(hair.alpha)}
+
+
+def joined_alpha(alpha: np.ndarray) -> np.ndarray:
+    """[S, 2 S]: the hair's alpha [S, S] beside that of the head, which is all there."""
+    return np.concatenate([np.ones_like(alpha), alpha], axis=1)
 
 
 def joined_surface(surface: Surface, hair: Mesh) -> Surface:

@@ -11,11 +11,12 @@ from shared.appearance.observations import face_front
 from shared.appearance.texture_pass import TexturePass
 from shared.compute.run_context import SILENT, RunContext
 from shared.geometry.mesh import Mesh
+from shared.geometry.parts import mesh_part
 from shared.geometry.surface import Surface
 from shared.hair.coverage import alpha_of, covered, look_for_hair
 from shared.hair.hair_pixels import CLOTH_PIXEL, HairPixels
 from shared.hair.hull import LEAST_MM, hull_radius
-from shared.hair.joined import HAIR_ROUGHNESS, HairSurface, joined_surface
+from shared.hair.joined import HAIR_ROUGHNESS, HairSurface, joined_alpha, joined_surface
 from shared.hair.shell_grid import ShellGrid
 from shared.hair.streaks import with_streaks
 from shared.imaging.frame_index import spread_frames
@@ -115,7 +116,7 @@ def find_hair(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray, vi
         context.note("hair: no outline tells how far out it reaches: no surface of its own")
         return None
     head = _pressed(viewer.mesh, surface, grid, radius, grid.of_grid(share))
-    mesh, used = _part(shell.mesh, (share > LEAST_SHARE)[shell.mesh.faces].any(1))
+    mesh, used = mesh_part(shell.mesh, (share > LEAST_SHARE)[shell.mesh.faces].any(1))
     record = {"thickness_mm": round(float(np.median(thick)), 1), "skull_covered": round(dome, 3),
               "seen_share": round(float((seen.looks > 0).mean()), 3),
               "lowest_mm": round(float(mesh.vertices[:, 1].min() - pixels.chin_mm), 1)}
@@ -128,8 +129,8 @@ def light_hair(hair: StandingHair, surface: Surface, views: Views, precomputed: 
     """Hair under the solved light, shaded by itself and by the head, which it casts no shadow on (see
     PrecomputedTransfer.with_standing). surface, precomputed, shading: the head's; error_mm: of its surface."""
     both = joined_surface(surface.with_mesh(hair.head), hair.mesh)
-    alpha = np.concatenate([np.ones_like(hair.alpha), hair.alpha], axis=1)
-    viewer, count = solid_viewer(both.mesh, alpha).within_rim(error_mm), len(surface.mesh.vertices)
+    viewer = solid_viewer(both.mesh, joined_alpha(hair.alpha)).within_rim(error_mm)
+    count = len(surface.mesh.vertices)
     faced = np.nonzero(face_front(viewer, views.camera_from_head, FACED))[0]
     index = faced[faced >= count]
     points = mesh_points(both.mesh, index)
@@ -183,12 +184,3 @@ def _pressed(mesh: Mesh, surface: Surface, grid: ShellGrid, radius: np.ndarray, 
     axis = np.where((row < grid.domed - 1)[:, None], grid.centre, places[index] * [0, 1, 0] + grid.centre * [1, 0, 1])
     places[index] = axis + shrink[:, None] * (places[index] - axis)
     return mesh.replace(vertices=places)
-
-
-def _part(mesh: Mesh, kept: np.ndarray) -> tuple[Mesh, np.ndarray]:
-    """Some of the faces, kept [F] bool, with the vertices that they use, and which ones these are [V]."""
-    used, corners = np.unique(mesh.faces[kept], return_inverse=True)
-    uvs, texture = np.unique(mesh.face_uvs[kept], return_inverse=True)
-    part = Mesh(mesh.vertices[used], corners.reshape(-1, 3).astype(np.int32), mesh.uvs[uvs],
-                texture.reshape(-1, 3).astype(np.int32))
-    return part, used

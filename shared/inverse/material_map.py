@@ -10,6 +10,7 @@ from shared.appearance.problem import AppearanceState
 from shared.compute.run_context import SILENT, RunContext
 from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface
+from shared.hair.hair_pixels import BEARD
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.material_labels import CLOTH, HAIR, UNKNOWN
 from shared.imaging.texels import SmoothFields, TexelSurface
@@ -18,9 +19,9 @@ from shared.rendering.shading import VertexShading
 
 FRONT_OF_NECK = 0.3, 0.6
 """Cosine of the neck's normal to straight ahead: above the second a beard reaches there, below the first none does."""
-BEARD, COLLAR, COVERED = (0.1, 0.3), (0.1, 0.3), (0.65, 0.95)
-"""Share of hair on the chin, of cloth on the neck, and of hair on an ear: up to the first there is no beard, no collar,
-or the ear is bare, whose hollows look like hair, too; from the second on there is one, or hair covers the ear."""
+COLLAR, COVERED = (0.1, 0.3), (0.65, 0.95)
+"""Share of cloth on the neck, and of hair on an ear: up to the first there is no collar, or the ear is bare, whose
+hollows look like hair, too; from the second on there is one, or hair covers the ear."""
 
 FAR_EDGES = 100.0
 """Over which hair that some frame shows tells what grows where none does."""

@@ -18,7 +18,7 @@ from pxr import Tf, UsdUtils
 from shared.errors import InputError, LimnError
 from shared.geometry.mesh_checks import mesh_errors, uv_overlap
 from shared.io.arrays import load_arrays
-from shared.io.export_maps import DISPLACEMENT, HAIR_MAPS, MAPS, map_errors, map_file, read_map
+from shared.io.export_maps import DISPLACEMENT, HAIR_MAPS, MAPS, map_errors, map_path, read_map
 from shared.io.exr_checks import header_errors, header_gaps
 from shared.io.exr_header import check_decodable
 from shared.io.gltf_validate import glb_errors
@@ -75,11 +75,11 @@ def check_export(
     checks = _Checks(folder, set(spoilt), older)
     checks.headers()
     checks.of("mesh.obj", checks.mesh)
-    hairy = bool(checks.files(HAIR_OBJ, *(_map_path(folder, name) for name in HAIR_MAPS)))
+    hairy = bool(checks.files(HAIR_OBJ, *(map_path(folder, name) for name in HAIR_MAPS)))
     if hairy:
         checks.of(HAIR_OBJ, checks.hair)
     for name in MAPS:
-        file = _map_path(folder, name)
+        file = map_path(folder, name)
         # the layers say whether there should be a displacement
         if hairy if name in HAIR_MAPS else name != DISPLACEMENT or checks.files(file):
             checks.of(file, lambda file, name=name: checks.map(file, name))
@@ -91,12 +91,6 @@ def check_export(
     checks.of("head.usdz", checks.usdz, required="head.usdz" in expected)
     checks.of("head.glb", checks.glb, required="head.glb" in expected)
     return checks.found
-
-
-def _map_path(folder: Path, name: str) -> str:
-    """maps/NAME.exr, or the tile of that name where there is one."""
-    tile = f"maps/{map_file(name, udim=True)}"
-    return tile if (folder / tile).is_file() else f"maps/{map_file(name, udim=False)}"
 
 
 class _Checks:
@@ -145,7 +139,7 @@ class _Checks:
 
     def headers(self) -> None:
         """Of every EXR: channels, colour space, unit, content."""
-        maps, lights = {_map_path(self.folder, name): name for name in MAPS}, set(self.files(*_LIGHTS))
+        maps, lights = {map_path(self.folder, name): name for name in MAPS}, set(self.files(*_LIGHTS))
         gaps: dict[str, list[str]] = {}
 
         def header(file: str) -> list[str]:

@@ -54,6 +54,12 @@ def map_file(name: str, udim: bool) -> str:
     return f"{name}.{UDIM_TILE}.exr" if udim else f"{name}.exr"
 
 
+def map_path(folder: Path, name: str) -> str:
+    """A map's file in a result's folder, from there: maps/NAME.exr, or the tile of that name where there is one."""
+    tile = f"maps/{map_file(name, udim=True)}"
+    return tile if (folder / tile).is_file() else f"maps/{map_file(name, udim=False)}"
+
+
 class MapWriter:
     """Writes linear Rec.709 and data arrays with one choice of precision, colour space, layout and names.
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from field_check import field_faults
+from opened_asset import opened_root, placed
 from pxr import Gf, Usd, UsdGeom, UsdShade
 from toy_result import EYE_CENTRES, FRAMES, ToyJob, toy_eyed_surface, toy_gaze, toy_poses, write_toy_work
 
@@ -33,14 +34,8 @@ def exported(request, tmp_path_factory):
 @pytest.fixture(params=FILES)
 def opened(request, exported):
     """(what moves, the root prim of either file), its stage kept open."""
-    stage = Usd.Stage.Open(str(exported[1] / request.param))
-    yield exported[0], stage.GetDefaultPrim()
-    del stage
-
-
-def placed(root, name, time):
-    """[4, 4] from a part's own axes to the asset's world."""
-    return np.array(UsdGeom.Imageable(root.GetPrimAtPath(f"geo/{name}")).ComputeLocalToWorldTransform(time)).T
+    for root in opened_root(exported[1] / request.param):
+        yield exported[0], root
 
 
 def corners(root, name, time):

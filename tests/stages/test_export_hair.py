@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from field_check import field_faults
+from opened_asset import opened_root, placed
 from pxr import Usd, UsdGeom, UsdShade
 from toy_result import FRAMES, HAIR_RECORD, MAP_SIZE, ToyJob, toy_hair, toy_mesh, toy_poses, write_toy_work
 
@@ -46,14 +47,8 @@ def exported(request, tmp_path_factory):
 @pytest.fixture(params=FILES)
 def opened(request, exported):
     """(what it is of, the root prim of either file), its stage kept open."""
-    stage = Usd.Stage.Open(str(exported[1] / request.param))
-    yield exported[0], stage.GetDefaultPrim()
-    del stage
-
-
-def placed(root, name, time):
-    """[4, 4] from a part's own axes to the asset's world."""
-    return np.array(UsdGeom.Imageable(root.GetPrimAtPath(f"geo/{name}")).ComputeLocalToWorldTransform(time)).T
+    for root in opened_root(exported[1] / request.param):
+        yield exported[0], root
 
 
 def world_from_head(kind, f):

@@ -18,6 +18,7 @@ from shared.hair.hair_files import read_hair
 from shared.hair.joined import joined_maps, joined_mesh
 from shared.imaging.turning_eyes import TurningEyes
 from shared.io.arrays import load_arrays, read_json
+from shared.io.export_maps import map_path
 from shared.io.exr_picture import read_rec709
 from shared.io.meshes import load_mesh, read_obj, read_obj_groups
 from shared.io.usd_actions import read_actions
@@ -92,7 +93,7 @@ def _open_result(path: Path) -> Asset:
     for name in ("camera_from_head", "frame_index", "intrinsics"):
         if name not in arrays:
             raise InputError(f"no {name}", where=str(folder / "poses.npz"), got=", ".join(sorted(arrays)))
-    maps = {name: _read_map(folder / "maps", name) for name in MAPS}
+    maps = {name: _read_map(folder, name) for name in MAPS}
     head = mesh
     if (hair := read_hair(folder)) is not None:
         mesh, maps = joined_mesh(mesh, hair.mesh), joined_maps(maps, hair)
@@ -110,10 +111,9 @@ def _open_result(path: Path) -> Asset:
 
 
 def _read_map(folder: Path, name: str) -> np.ndarray:
-    """maps/NAME.exr, or the only tile of a UDIM set."""
-    path = next((p for p in (folder / f"{name}.exr", folder / f"{name}.1001.exr") if p.is_file()), None)
-    if path is None:
-        raise InputError("a map is missing", where=str(folder / f"{name}.exr"))
+    path = folder / map_path(folder, name)
+    if not path.is_file():
+        raise InputError("a map is missing", where=str(path))
     return read_rec709(path)
 
 

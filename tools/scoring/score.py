@@ -200,8 +200,10 @@ def score_texels(
     truth = read_obj(subject / "gt" / "mesh.obj"), read_exr(subject / "gt" / "albedo.exr"), true_poses
     own = result.mesh, result.textures["albedo"], result.textures[CONFIDENCE]
     surface = segmented_surface(result.folder)
-    segments = () if surface is None else (surface.face_segment, surface.segment_names)
-    return albedo_pairs(truth, own, truth_from_result, rng).wrong_where_sure(gain, *segments)
+    pairs = albedo_pairs(truth, own, truth_from_result, rng)
+    if surface is None:
+        return pairs.wrong_where_sure(gain)
+    return pairs.wrong_where_sure(gain, surface.face_segment, surface.segment_names)
 
 
 def read_render(export: Path, frame: int) -> np.ndarray | None:
