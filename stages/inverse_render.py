@@ -176,7 +176,7 @@ def write_maps(job: Job, result) -> None:
     from shared.io.images import write_exr
 
     (job.out / "maps").mkdir()
-    for name, image in result.maps.items():
+    for name, image in result.texels.maps.items():
         colour_space = "lin_rec709_scene" if name == "diffuse_albedo" else "data"
         attributes = {"content": FLAT_NORMALS} if name == "normal" and not result.record.get("relief") else {}
         write_exr(job.out / "maps" / f"{name}.exr", image, colour_space=colour_space, attributes=attributes)
@@ -187,7 +187,8 @@ def write_material_map(job: Job, result) -> None:
     from shared.inverse.material_map import material_image
     from shared.io.material_maps import write_material
 
-    probabilities = material_image(result.mesh, result.materials, len(result.maps["confidence"]))
+    solved = result.texels
+    probabilities = material_image(solved.mesh, solved.materials, len(solved.maps["confidence"]))
     write_material(job.out / "maps" / "material.exr", probabilities, half=True, attributes={"content": "material"})
 
 
@@ -229,7 +230,8 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
     frames, index = clip.frames, clip.frame_index
     poses = result.views.camera_from_head[first : first + len(index)]
     covariance = {} if result.covariance is None else {"covariance": result.covariance}
-    turning = result.eyes is not None
+    texels = result.texels
+    turning = texels.eyes is not None
     turn = result.views.gaze[first : first + len(index)] if turning else None
     gaze = np.full_like(turn, np.nan) if turning and clip.gaze is None else clip.gaze
     gain = None if result.views.gain is None else result.views.gain[first : first + len(index)]
@@ -243,12 +245,12 @@ def write_clip(job: Job, folder: Path, clip, first: int, result, light) -> dict:
         **({"gaze": gaze, "eye_turn": turn} if turning else {}),
         **({} if gain is None else {"gain": gain}),
     )
-    seen = result.maps if result.hair is None else joined_maps(result.maps, result.hair)
+    seen = texels.maps if texels.hair is None else joined_maps(texels.maps, texels.hair)
     maps = SurfaceMaps(seen["diffuse_albedo"], seen["specular_intensity"], seen.get("alpha"))
     chosen = shown_frames(len(index), job.params.render_count, clip.gaze)
     for f in job.progress(chosen, "re-rendering"):
-        eyes = LookingEyes(result.eyes, turn[f]) if turning else None
-        image, _ = render_frame(result.viewer, result.shading, maps, first + f, poses[f], clip.lens, clip.views.size,
+        eyes = LookingEyes(texels.eyes, turn[f]) if turning else None
+        image, _ = render_frame(texels.viewer, texels.shading, maps, first + f, poses[f], clip.lens, clip.views.size,
                                 eyes=eyes)
         image = image if gain is None else image * gain[f]
         write_exr(folder / "renders" / f"{index[f]:06d}.exr", image, colour_space="lin_rec709_scene")
@@ -323,9 +325,9 @@ def run(job: Job) -> None:
         job.warn(text)
     write_maps(job, result)
     write_material_map(job, result)
-    write_shape(job, surface, result.mesh)
-    if result.hair is not None:
-        write_hair(job.out, result.hair)
+    write_shape(job, surface, result.texels.mesh)
+    if result.texels.hair is not None:
+        write_hair(job.out, result.texels.hair)
     lights, own = np.split(result.solution.state.light, len(clips)), []
     for k, (clip, rows) in enumerate(zip(clips, views.frames_of_lights, strict=True)):
         folder = job.out / "clips" / job.clips[k] if k else job.out

@@ -1,4 +1,4 @@
-"""Inverse rendering of a clip: what a solver is given, what it returns, and what all solvers need of a clip."""
+"""Inverse rendering of a clip: what a solver is given, and what all solvers need of a clip."""
 
 from __future__ import annotations
 
@@ -9,14 +9,10 @@ import numpy as np
 from shared.appearance.fit import Solution
 from shared.appearance.observations import face_front
 from shared.appearance.problem import AppearanceSettings
-from shared.appearance.texture import TexelMaterial
 from shared.compute.run_context import RunContext
-from shared.geometry.mesh import Mesh
 from shared.geometry.surface import Surface
-from shared.hair.joined import HairSurface
 from shared.imaging.frame_index import hold_out, spread_frames
 from shared.imaging.image_sampling import SurfaceViewer
-from shared.imaging.turning_eyes import TurningEyes
 from shared.imaging.views import Views
 from shared.inverse.frame_choice import covering_frames
 from shared.published.settings import ReferenceSettings
@@ -54,28 +50,6 @@ class InverseSettings:
     pose_rounds: int = 3
     lamp_distance: float | None = None
     smooth_rim: bool = False
-
-
-@dataclass(frozen=True)
-class InverseResult:
-    """solution of the appearance fit, the texels' material, maps by name, the head's final mesh, the vertices' shading
-    in all views, the viewer of the mesh, what its vertices show [V, len(LABELS)], the views with their poses and which
-    were fitted, and what is worth recording; covariance [F, 6, 6] of poses that were tracked again, None: they are as
-    they were given; eyes: those of the mesh, which turn with the views' gaze, None: they do not; hair: where it has a
-    surface of its own, which viewer and shading then have, too, after the head."""
-
-    solution: Solution
-    material: TexelMaterial
-    maps: dict[str, np.ndarray]
-    mesh: Mesh
-    shading: VertexShading
-    viewer: SurfaceViewer
-    materials: np.ndarray
-    views: Views
-    record: dict
-    covariance: np.ndarray | None = None
-    eyes: TurningEyes | None = None
-    hair: HairSurface | None = None
 
 
 def some_views(views: Views, settings: InverseSettings, wanted: int) -> Views:

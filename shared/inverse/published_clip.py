@@ -25,7 +25,8 @@ from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import TexelSurface
 from shared.imaging.views import Views
 from shared.inverse.material_map import clip_materials
-from shared.inverse.problem import FACE_SKIN, InverseResult, InverseSettings, shade_vertices
+from shared.inverse.problem import FACE_SKIN, InverseSettings, shade_vertices
+from shared.inverse.result import InverseResult, SolvedTexels
 from shared.io.arrays import load_arrays, save_arrays
 from shared.published.settings import ReferenceSettings
 from shared.published.solver import ReferenceSolver, Start
@@ -188,7 +189,8 @@ def conclude(
         "warnings": [],
     }
     materials = clip_materials(viewer, shading, views, surface, state, context)
-    return InverseResult(solution, material, maps, viewer.mesh, shading, viewer, materials, views, record)
+    solved = SolvedTexels(material, maps, viewer.mesh, materials, viewer, shading)
+    return InverseResult(solution, solved, views, record)
 
 
 def map_material(solver: ReferenceSolver, average: Average) -> TexelMaterial:

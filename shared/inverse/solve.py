@@ -25,13 +25,9 @@ from shared.inverse.exposure import exposure_warnings, solve_exposure
 from shared.inverse.lamp_distance import describe_lamp, find_lamp
 from shared.inverse.lit_surface import LitSurface, report_to
 from shared.inverse.model_selection import select
-from shared.inverse.problem import (
-    InverseResult,
-    InverseSettings,
-    frames_to_fit,
-    some_views,
-)
+from shared.inverse.problem import InverseSettings, frames_to_fit, some_views
 from shared.inverse.published_clip import solve_by_reference
+from shared.inverse.result import InverseResult
 from shared.inverse.shaping import shape_and_turn
 from shared.inverse.solve_texels import solve_texels
 from shared.shape.refine import meet_outline, surface_error
@@ -103,10 +99,10 @@ def solve_clip(
     covariance, pose_record = shaped.covariance, shaped.pose_record
     lit = shaped = None  # texels need the memory that the points' samples and transfer take
     stands_off = outline.get("met", 1.0) < LEAST_MET
-    texels = solve_texels(views, surface, viewer, precomputed, settings, solution, stands_off, context)
+    texels, told = solve_texels(views, surface, viewer, precomputed, settings, solution, stands_off, context)
     typical = np.median(solution.state.albedo, axis=0)
     record = {
-        **texels.record,
+        **told,
         "shape": {**shape_record, "outline": outline},
         "poses": pose_record,
         "exposure": {} if exposure is None else exposure.record,
@@ -118,8 +114,7 @@ def solve_clip(
         "albedo_scale": describe_scale(chart, typical, whites, solution.scale),
         "model_selection": () if selected is None else selected.candidates,
     }
-    return InverseResult(solution, texels.material, texels.maps, texels.mesh, texels.shading, texels.viewer,
-                         texels.materials, views, record, covariance, texels.eyes, texels.hair)
+    return InverseResult(solution, texels, views, record, covariance)
 
 
 def said_by_chart(
@@ -166,7 +161,7 @@ def describe_light(state) -> str:
 def summarise(result: InverseResult, moves: str) -> dict:
     """What solve.json says, but for which frames were rendered and held out; moves: the head or the camera."""
     solution, state = result.solution, result.solution.state
-    seen, tried = result.material.information > 1.0, result.record.get("model_selection")
+    seen, tried = result.texels.material.information > 1.0, result.record.get("model_selection")
     return {
         "model": {
             "light": describe_light(state),
@@ -220,7 +215,7 @@ def warnings_about(result: InverseResult) -> list[str]:
             f"frames held out fit worse ({solution.held_out:.4f}) than fitted ones ({solution.fitted:.4f}): "
             "poses or shape may be off, or the light changed"
         )
-    if (result.maps["confidence"] > 0.5).mean() < LEAST_SEEN_SHARE:
+    if (result.texels.maps["confidence"] > 0.5).mean() < LEAST_SEEN_SHARE:
         found.append("the clip determines hardly any of the maps (see the confidence map): its frames contradict each "
                      "other, or are too dark or blurred")
     if solution.held_out > 0.06:

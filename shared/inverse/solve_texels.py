@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from shared.appearance.catchlights import check_catchlights
 from shared.appearance.fine_normals import NormalPass, resolved_texels
 from shared.appearance.fit import Solution
 from shared.appearance.maps import make_maps
-from shared.appearance.texture import TexelMaterial
 from shared.appearance.texture_pass import TexturePass
 from shared.compute.run_context import RunContext
-from shared.geometry.mesh import Mesh, diffused
+from shared.geometry.mesh import diffused
 from shared.geometry.surface import Surface
-from shared.hair.joined import HairSurface
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import TexelSurface
 from shared.imaging.turning_eyes import LIDS, EyeTexels, TurningEyes
@@ -23,9 +19,9 @@ from shared.imaging.views import Views
 from shared.inverse.hair_surface import find_hair, light_hair, texture_hair
 from shared.inverse.material_map import clip_materials, hidden_places, matt_share
 from shared.inverse.problem import FACE_SKIN, InverseSettings, shade_vertices
+from shared.inverse.result import SolvedTexels
 from shared.rendering.eye_shine import EyeShine
 from shared.rendering.precomputed_transfer import PrecomputedTransfer
-from shared.rendering.shading import VertexShading
 from shared.shape.gauss_newton import typical_edge
 
 SPECULAR_WIDTHS = (np.inf, 1 / 16, 1 / 64)
@@ -34,29 +30,12 @@ HAIRLINE_MM = 10.0
 """Bends of the hairline shorter than this are the mesh's, not the hair's."""
 
 
-@dataclass(frozen=True, eq=False)
-class SolvedTexels:
-    """The texels' material, maps by name, the head's mesh, what its vertices show [V, len(LABELS)], the viewer and the
-    shading of what is seen in the frames: the head and, where it stands off, hair; eyes of that, None: they do not
-    turn; hair, None: it has no surface of its own; record: what is worth recording."""
-
-    material: TexelMaterial
-    maps: dict[str, np.ndarray]
-    mesh: Mesh
-    materials: np.ndarray
-    viewer: SurfaceViewer
-    shading: VertexShading
-    eyes: TurningEyes | None
-    hair: HairSurface | None
-    record: dict
-
-
 def solve_texels(
     views: Views, surface: Surface, viewer: SurfaceViewer, precomputed: PrecomputedTransfer, settings: InverseSettings,
     solution: Solution, stands_off: bool, context: RunContext,
-) -> SolvedTexels:
-    """surface, viewer, precomputed: of the solved mesh; stands_off: whether frames show that the scalp is not the
-    head's outline, so that hair has a surface of its own."""
+) -> tuple[SolvedTexels, dict]:
+    """The texels, and what is worth recording. surface, viewer, precomputed: of the solved mesh; stands_off: whether
+    frames show that the scalp is not the head's outline, so that hair has a surface of its own."""
     shading = shade_vertices(views, viewer, precomputed, settings.appearance, solution, context)
     texels, mesh = TexelSurface(surface.mesh, settings.map_size), surface.mesh
     typical = np.median(solution.state.albedo, axis=0)
@@ -101,7 +80,7 @@ def solve_texels(
         "catchlights": catchlights,
     }
     shown = viewer if hair is None else SurfaceViewer.of(surface.mesh)
-    return SolvedTexels(material, maps, mesh, materials, shown, shading, eyes, hair, record)
+    return SolvedTexels(material, maps, mesh, materials, shown, shading, eyes, hair), record
 
 
 def scalp_of(surface: Surface) -> np.ndarray | None:

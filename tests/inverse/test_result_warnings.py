@@ -18,7 +18,7 @@ def fit_of(roughness=0.4, specular=0.7, highlights_count=True):
 def test_maps_that_are_hardly_determined_are_said(known, warned):
     confidence = np.where(np.linspace(0.0, 1.0, 1000) < known, 0.9, 0.2)
     result = SimpleNamespace(
-        record={"warnings": []}, maps={"confidence": confidence},
+        record={"warnings": []}, texels=SimpleNamespace(maps={"confidence": confidence}),
         solution=SimpleNamespace(fitted=0.02, held_out=0.02, **vars(fit_of())),
     )
     assert any("hardly any of the maps" in text for text in warnings_about(result)) is warned

@@ -64,17 +64,17 @@ def test_it_finds_the_albedo(clip):
         states.setdefault("notes", []).append(text)
 
     first = solve_clip(clip.views, clip.surface, settings_of(clip, iterations=1), RunContext(nothing, note))
-    seen = first.maps["confidence"] > 0.9
+    seen = first.texels.maps["confidence"] > 0.9
     assert 0.1 < seen.mean() < 0.8
     result = solve_clip(clip.views, clip.surface, settings_of(clip, iterations=160), RunContext(nothing, note))
-    before, after = (albedo_error(r.maps["diffuse_albedo"], seen) for r in (first, result))
+    before, after = (albedo_error(r.texels.maps["diffuse_albedo"], seen) for r in (first, result))
     assert after < 0.6 * before and after < 0.11
     assert result.solution.fitted < 0.6 * first.solution.fitted
     record = summarise(result, "head")
     assert np.nonzero(~result.views.fitted)[0].tolist() == [2, 6]
     assert np.isfinite([record["residuals"]["fitted"], record["residuals"]["held_out"]]).all()
     assert any("iteration 160" in line for line in states["notes"])
-    assert result.shading.irradiance(0).shape == (len(clip.mesh.vertices), 3)
+    assert result.texels.shading.irradiance(0).shape == (len(clip.mesh.vertices), 3)
 
 
 def test_a_run_that_was_cut_off_goes_on_as_if_it_had_not_been(clip, tmp_path):
@@ -103,7 +103,7 @@ def test_a_run_that_was_cut_off_goes_on_as_if_it_had_not_been(clip, tmp_path):
         solve_clip(clip.views, clip.surface, settings_of(clip, **options), RunContext(cut, notes.append))
     parts = solve_clip(clip.views, clip.surface, settings_of(clip, **options), RunContext(nothing, notes.append))
     assert any("goes on from iteration 10" in text for text in notes)
-    assert np.array_equal(parts.maps["diffuse_albedo"], whole.maps["diffuse_albedo"])
+    assert np.array_equal(parts.texels.maps["diffuse_albedo"], whole.texels.maps["diffuse_albedo"])
     assert np.array_equal(parts.solution.state.light, whole.solution.state.light)
     assert not path.exists()
 
@@ -126,7 +126,7 @@ def test_vertices_move_towards_the_outline(clip):
     assert field_faults(record, SOLVE) == []
     assert {f"iterations[].{name}" for name in ("iteration", "image", "mask", "laplacian", "white_light", "diffuse",
                                                 "roughness_variation")} <= written_fields(record, SOLVE)
-    moved = result.mesh.vertices
+    moved = result.texels.mesh.vertices
     rim = np.abs(clip.mesh.vertices[:, 0]) > 60.0
     before = np.linalg.norm(small.mesh.vertices[rim] - clip.mesh.vertices[rim], axis=1).mean()
     after = np.linalg.norm(moved[rim] - clip.mesh.vertices[rim], axis=1).mean()
@@ -152,7 +152,7 @@ def test_the_other_methods_models_are_followed(clip, monkeypatch):
     its rays seeks the light."""
     changes = {"iterations": 3, "pixels": 100}
     matte = settings_of(clip, **changes, sampling=Sampling(8, 8, 4, specular=False))
-    assert (solve_clip(clip.views, clip.surface, matte).maps["specular_intensity"] == 0.0).all()
+    assert (solve_clip(clip.views, clip.surface, matte).texels.maps["specular_intensity"] == 0.0).all()
     poses, three = [], replace(settings_of(clip, **changes), fit_frames=3)
     fitted = frames_to_fit(clip.views, clip.surface, three, SurfaceViewer.of(clip.mesh))
     solve_by_reference(clip.views.with_fitted(fitted), clip.surface, three, three.reference, SILENT,
@@ -160,7 +160,7 @@ def test_the_other_methods_models_are_followed(clip, monkeypatch):
     assert len(poses) == 3 and all(np.array_equal(seen, clip.views.camera_from_head[fitted]) for seen in poses)
     monkeypatch.setattr(Shader, "_open", None)
     unshadowed = settings_of(clip, **changes, sampling=Sampling(visibility=False))
-    assert np.isfinite(solve_clip(clip.views, clip.surface, unshadowed).maps["diffuse_albedo"]).all()
+    assert np.isfinite(solve_clip(clip.views, clip.surface, unshadowed).texels.maps["diffuse_albedo"]).all()
     with pytest.raises(TypeError):
         solve_clip(clip.views, clip.surface, settings_of(clip, **changes))
 

@@ -157,7 +157,7 @@ def _transfer_row(subject: Path, run: Path, tracked: bool, changes: dict) -> dic
     inputs, clock = open_clip(subject, run, tracked), Clock()
     result = solve_clip(inputs.views, inputs.surface, settings_of(changes), RunContext(note=print))
     found = {"seconds": clock.cpu_s, "iteration": len(result.solution.iterations)}
-    return found | map_errors(subject, inputs, inputs.frame_index, result.mesh, result.maps)
+    return found | map_errors(subject, inputs, inputs.frame_index, result.texels.mesh, result.texels.maps)
 
 
 class PublishedBench(ClipBench):

@@ -117,4 +117,4 @@ class ShapeBench(ClipBench):
         result = solve_clip(self.clip.views, self.clip.surface, settings)
         found = {"smoothness": smoothness, "seconds": clock.wall_s, "held_out_residual": result.solution.held_out,
                  "stopped": result.record["shape"]["stopped_vertices"]}
-        return found | shape_errors(self.options.subject, self.clip, result.viewer.mesh)
+        return found | shape_errors(self.options.subject, self.clip, result.texels.viewer.mesh)
