@@ -113,6 +113,7 @@ REFERENCES = {
     "Liang1986":
         "Liang, Zeger, Longitudinal Data Analysis Using Generalized Linear Models. Biometrika 73, 1986.",
     "Loop1987": "Loop, Smooth Subdivision Surfaces Based on Triangles. Master's thesis, University of Utah, 1987.",
+    "Mackay1992": "MacKay, Bayesian Interpolation. Neural Computation 4 (3), 1992.",
     "Mccamy1976":
         "McCamy, Marcus, Davidson, A Color-Rendition Chart. Journal of Applied Photographic Engineering 2, 1976.",
     "Mikkelsen2008":
@@ -139,6 +140,7 @@ REFERENCES = {
     "Schaefer2006": "Schaefer, McPhail, Warren, Image Deformation Using Moving Least Squares. SIGGRAPH 2006.",
     "Schlick1994":
         "Schlick, An Inexpensive BRDF Model for Physically-based Rendering. Computer Graphics Forum 13, 1994.",
+    "Schwarz1978": "Schwarz, Estimating the Dimension of a Model. Annals of Statistics 6 (2), 1978.",
     "Shi1994": "Shi, Tomasi, Good Features to Track. CVPR 1994.",
     "Sloan2002":
         "Sloan, Kautz, Snyder, Precomputed Radiance Transfer for Real-Time Rendering in Dynamic, Low-Frequency "
@@ -147,6 +149,9 @@ REFERENCES = {
     "Smith2019":
         "Smith, de Goes, Kim, Analytic Eigensystems for Isotropic Distortion Energies. ACM Transactions on Graphics "
         "38, 2019.",
+    "Stone1977":
+        "Stone, An Asymptotic Equivalence of Choice of Model by Cross-Validation and Akaike's Criterion. Journal of "
+        "the Royal Statistical Society B 39 (1), 1977.",
     "Szeliski1997":
         "Szeliski, Kang, Shape Ambiguities in Structure from Motion. IEEE Transactions on Pattern Analysis and "
         "Machine Intelligence 19, 1997.",

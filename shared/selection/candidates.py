@@ -15,7 +15,10 @@ candidate must let that fall by a share that is worth its unknowns. Where the fa
 that share, the frames leave it open, and the fuller model is taken. Candidates are not all nested (a sun in the sky is
 no special case of harmonics), so that the one beyond a candidate that did not serve is tried, too.
 
-Reference: [Breiman1984], section 3.4.3 (the standard error of the fall).
+docs/selection.md derives this, and says what of the marginal likelihood it leaves out.
+
+References: [Breiman1984], section 3.4.3 (the standard error of the fall); [Mackay1992], [Schwarz1978] (the marginal
+likelihood); [Stone1977] (what held-out samples charge for an unknown).
 """
 
 from __future__ import annotations

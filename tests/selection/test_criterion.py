@@ -1,4 +1,4 @@
-"""The criterion of model selection on heads whose best model is known, since all of them is linear and Gaussian.
+"""The criterion of model selection on heads whose best model is known, since all is linear and Gaussian.
 
 A grey head of a few points: the logarithm of what a frame shows of a point is its log albedo, drawn from the prior on
 skin, a light of few harmonics along the point's normal, and noise. Simple and fuller models know harmonics to a lower
@@ -209,6 +209,12 @@ def test_a_likely_albedo_keeps_the_simple_model_where_no_frame_tells():
     found = heads(2, "camera", 0.0)
     assert sum(some.decision(some.joint).accepted for some in found) <= 1
     assert max(some.evidence for some in found) < 0.0
+
+
+def test_weak_unknowns_that_are_there_are_taken_earlier_than_by_their_marginal_likelihood():
+    """What their volumes would cost is no reason to leave them out."""
+    found = [some for some in heads(4, "head", 0.01) if some.evidence < -5.0]
+    assert len(found) > SEEDS / 2 and np.mean([some.decision(some.joint).accepted for some in found]) > 0.7
 
 
 CASES = [
