@@ -93,6 +93,7 @@ class TexturePass:
     contradict each other there;
     hidden [V]: probability that frames show what hangs before a place, and so say nothing of it; None: nowhere;
     matt [V]: share of what has no highlights of the surface's lobe; None: none has;
+    shaded [V]: standard deviation of the log irradiance by shadows that the shading lacks; None: it lacks none;
     eyes: texels that turn with the views' gaze, and of which skin says nothing; None: none do.
     """
 
@@ -111,6 +112,7 @@ class TexturePass:
         bare: np.ndarray | None = None,
         hidden: np.ndarray | None = None,
         matt: np.ndarray | None = None,
+        shaded: np.ndarray | None = None,
         context: RunContext = SILENT,
         eyes: EyeTexels | None = None,
     ):
@@ -126,6 +128,7 @@ class TexturePass:
         self.shines = np.ones(len(surface), np.float32) if matt is None else self._at_texels(1.0 - matt)
         self.seen = None if hidden is None else self._at_texels(1.0 - hidden)
         self.specular, self.lobe = self._with_eyes(specular * self.shines), specular
+        self.shaded = 0.0 if shaded is None else self._at_texels(shaded)
         self.region = region
         self.bare = 1.0 if bare is None else surface.interpolate(bare[:, None].astype(np.float32))
         self.hidden_variance = 0.0
@@ -170,7 +173,7 @@ class TexturePass:
         }
         chosen = way * len(widths) + best
         material = self._without_seams(candidates[chosen], around[chosen], told)
-        return replace(material, unmodelled=np.square(strands)), record
+        return replace(material, unmodelled=np.square(strands) + np.square(self.shaded)), record
 
     def _accumulate(self, material: TexelMaterial | None, frames: np.ndarray, label: str) -> Evidence:
         parts = [NormalEquations(len(self.surface), self.noise) for _ in self.systematic]

@@ -12,6 +12,7 @@ from shared.appearance.texture_pass import TexturePass
 from shared.compute.run_context import SILENT, RunContext
 from shared.geometry.mesh import Mesh
 from shared.geometry.parts import mesh_part
+from shared.geometry.raycast import RAY_START_MM
 from shared.geometry.surface import Surface
 from shared.hair.coverage import alpha_of, covered, look_for_hair
 from shared.hair.hair_pixels import CLOTH_PIXEL, HairPixels
@@ -23,6 +24,7 @@ from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer, sample_colours
 from shared.imaging.texels import TexelSurface
 from shared.imaging.views import Views
+from shared.inverse.problem import FACE_SKIN
 from shared.rendering.precomputed_transfer import PrecomputedTransfer
 from shared.rendering.render import solid_viewer
 from shared.rendering.shading import VertexShading
@@ -46,6 +48,11 @@ SEEN = 1.0
 """Information on a texel's log albedo from which on its own streaks are known."""
 GAP_MM = 1.0
 """Between hair and what it presses flat."""
+SHADOW_DIRECTIONS, SHADOW_BLOCK = 192, 4096
+"""That the light which hair keeps off the head is summed along, and vertices at a time."""
+SHADOW_SPREAD = 3.0**-0.5
+"""Root mean square of what hair keeps off, over what its hull does: hulls are larger, so it is anything from none of
+that to all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +151,28 @@ def light_hair(hair: StandingHair, surface: Surface, views: Views, precomputed: 
     head = Mesh(joined.vertices, joined.faces[:faces], surface.mesh.uvs, surface.mesh.face_uvs)
     own = Mesh(joined.vertices, joined.faces[faces:], hair.mesh.uvs, hair.mesh.face_uvs)
     return HairyHead(both, viewer, lit, head, own)
+
+
+def light_kept_off(lit: HairyHead, surface: Surface, shading: VertexShading) -> np.ndarray:
+    """[V]: by how much the light at the head's vertices may be wrong, in its logarithm, since hair casts no shadow on
+    the head: the share that it keeps off, in the mean over the frames, beside that of the median of the face's skin, by
+    which the light was solved. surface, shading: the head's before it got hair."""
+    rng = np.random.default_rng(0)
+    some = rng.choice(len(shading.directions), min(SHADOW_DIRECTIONS, len(shading.directions)), replace=False)
+    towards, brightness = shading.directions[some], shading.light_along[some].mean((1, 2))
+    start = shading.points.positions + RAY_START_MM * shading.points.normals
+    share = np.zeros(len(start))
+    for first in range(0, len(start), SHADOW_BLOCK):
+        part = slice(first, first + SHADOW_BLOCK)
+        arriving = shading.transfer.direct[part][:, some] * brightness
+        point, direction = np.nonzero(arriving > 0.0)
+        blocked = lit.viewer.scene.occluded(start[part][point], towards[direction])
+        lost = np.bincount(point, arriving[point, direction] * blocked, len(arriving))
+        share[part] = lost / np.maximum(arriving.sum(1), 1e-12)
+    on_face = surface.vertices_of(FACE_SKIN)[shading.index]
+    found = np.zeros(len(surface.mesh.vertices))
+    found[shading.index] = SHADOW_SPREAD * np.abs(share - np.median(share[on_face]))
+    return found
 
 
 def texture_hair(hair: StandingHair, lit: HairyHead, views: Views, context: RunContext) -> HairSurface:

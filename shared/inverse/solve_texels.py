@@ -16,7 +16,7 @@ from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.texels import TexelSurface
 from shared.imaging.turning_eyes import LIDS, EyeTexels, TurningEyes
 from shared.imaging.views import Views
-from shared.inverse.hair_surface import find_hair, light_hair, texture_hair
+from shared.inverse.hair_surface import find_hair, light_hair, light_kept_off, texture_hair
 from shared.inverse.material_map import clip_materials, hidden_places, matt_share
 from shared.inverse.problem import FACE_SKIN, InverseSettings, shade_vertices
 from shared.inverse.result import SolvedTexels
@@ -44,11 +44,12 @@ def solve_texels(
     if scalp is not None:
         hidden = hidden_places(viewer, surface, materials)
         matt = matt_share(viewer, surface, materials, hidden, scalp)
-    standing, hair = None, None
+    standing, hair, shaded = None, None, None
     if scalp is not None and stands_off:
         standing = find_hair(viewer, surface, materials, views, settings.map_size, context)
     if standing is not None:
         lit = light_hair(standing, surface, views, precomputed, shading, viewer.error_mm)
+        shaded = lit.with_hair(light_kept_off(lit, surface, shading))
         viewer, shading, surface, mesh = lit.viewer, lit.shading, lit.surface, standing.head
         texels = TexelSurface(lit.head, settings.map_size)
         scalp, hidden, matt, bare = (lit.with_hair(values) for values in (scalp, hidden, matt, bare))
@@ -57,8 +58,8 @@ def solve_texels(
     eye_texels = None if eyes is None else EyeTexels(texels, viewer, eyes, surface.faces_of(LIDS))
     texture = TexturePass(
         texels, viewer, shading, views, specular=solution.state.specular, typical_albedo=typical,
-        light_weights=solution.light_weights, region=scalp, bare=bare, hidden=hidden, matt=matt, context=context,
-        eyes=eye_texels,
+        light_weights=solution.light_weights, region=scalp, bare=bare, hidden=hidden, matt=matt, shaded=shaded,
+        context=context, eyes=eye_texels,
     )
     widths = settings.map_size * np.array(SPECULAR_WIDTHS if settings.appearance.specular else (np.inf,))
     material, texture_record = texture.run(widths)

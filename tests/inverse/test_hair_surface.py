@@ -1,16 +1,21 @@
 """Hair that stands off a ball of a head, in drawn pictures: found, measured, and lit with the head."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from field_check import below, field_faults
-from toy_hair import HAIR_MM, HAIRLINE_MM, HEAD_MM, hairy_ball
+from toy_hair import HAIR_MM, HAIRLINE_MM, HEAD_MM, hairy_ball, toy_surface
 
 from shared.compute.run_context import RunContext
 from shared.contract.records import RUN, SOLVE
-from shared.geometry.mesh import face_normals
+from shared.geometry.mesh import face_normals, vertex_normals
 from shared.geometry.raycast import RayScene
+from shared.geometry.transforms import fibonacci_sphere
 from shared.imaging.image_sampling import SurfaceViewer
-from shared.inverse.hair_surface import find_hair
+from shared.inverse.hair_surface import SHADOW_SPREAD, find_hair, light_kept_off
+from shared.inverse.problem import FACE_SKIN
+from shared.rendering.transfer import mesh_points
 
 
 @pytest.fixture(scope="module")
@@ -78,3 +83,27 @@ def test_hair_whose_end_no_frame_shows_has_no_surface(monkeypatch):
     context = RunContext(lambda items, label: items, notes.append)
     assert find_hair(SurfaceViewer.of(surface.mesh), surface, materials, views, 64, context) is None
     assert len(notes) == 1 and "no outline tells" in notes[0]
+
+
+def test_what_light_a_wall_of_hair_keeps_off_is_known():
+    """Hair that stands beside the head as one great plane x = 100 mm covers (1 + n_x) / 2 of a place of normal n under
+    an even light. What it takes from the face is in the light that was solved there."""
+    surface = toy_surface()
+    mesh, directions = surface.mesh, fibonacci_sphere(1500)
+    index = np.nonzero(mesh.vertices[:, 1] > -70.0)[0]
+    points = mesh_points(mesh, index)
+    direct = np.maximum(points.normals @ directions.T, 0.0) * 4.0 / len(directions)
+    shading = SimpleNamespace(index=index, points=points, directions=directions, transfer=SimpleNamespace(direct=direct),
+                              light_along=np.ones((len(directions), 3, 3)))
+    wall = 100.0 * np.array([[1, -500, -500], [1, 500, -500], [1, 500, 500], [1, -500, 500]])
+    scene = RayScene(np.concatenate([mesh.vertices, wall]),
+                     np.concatenate([mesh.faces, len(mesh.vertices) + np.array([[0, 1, 2], [0, 2, 3]])]))
+    found = light_kept_off(SimpleNamespace(viewer=SimpleNamespace(scene=scene)), surface, shading)
+    covered = (1.0 + vertex_normals(mesh.vertices, mesh.faces)[:, 0]) / 2.0
+    face = surface.vertices_of(FACE_SKIN)
+    expected = SHADOW_SPREAD * np.abs(covered - np.median(covered[index][face[index]]))
+    ears = surface.vertices_of(("ears",))  # not convex
+    at = index[~ears[index]]
+    assert np.abs(found[at] - expected[at]).mean() < 0.03
+    assert np.corrcoef(found[at], expected[at])[0, 1] > 0.97
+    assert (found[np.setdiff1d(np.arange(len(found)), index)] == 0.0).all()
