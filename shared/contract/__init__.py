@@ -4,7 +4,7 @@ A stage file declares `STAGE = Stage(...)`, defines `run(job)` and `check(job)` 
 `raise SystemExit(main(STAGE, run, check))`. Keep torch, cv2 and the like out of its top level (import them where they
 are used): a stage whose result is current then answers at once.
 
-Read in this order: wording, declare, records, shapes, chart_place, confine, subject, models, hashing,
+Read in this order: wording, declare, records, shapes, chart_place, grey_place, confine, subject, models, hashing,
 manifest, folders, needs, source, pipeline, progress, job, currency, drift, machine, provenance, sums, disk, limits,
 cache_folder, interpreter, request, execute, cli, launch, fork_server, fork_client.
 May import: errors.

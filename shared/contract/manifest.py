@@ -18,7 +18,7 @@ from shared.errors import InputError, LimnError
 SCHEMA = 1
 MANIFEST, PROVENANCE, LOG = "manifest.json", "provenance.json", "log.txt"
 RECORDS = (MANIFEST, PROVENANCE, LOG)
-SUBJECT_INPUT, VIDEO_INPUT, CHART_INPUT = "subject.yaml", "video", "chart"
+SUBJECT_INPUT, VIDEO_INPUT, CHART_INPUT, GREY_INPUT = "subject.yaml", "video", "chart", "grey"
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,8 @@ def make_work(stage: Stage, parameters: Mapping[str, object], inputs: Mapping[st
 def source_inputs(stage: Stage, subject: Subject, memory: HashMemory) -> dict[str, str]:
     """{name: SHA-256} of what the stage reads of the subject itself.
 
-    That is its settings, of the first stage the clip and where a colour chart is, and files of another tracker.
+    That is its settings, of the first stage the clip and where a colour chart or a grey place is, and files of
+    another tracker.
     """
     inputs = {SUBJECT_INPUT: hash_value(subject.content())}
     if stage.reads_source:
@@ -84,6 +85,8 @@ def source_inputs(stage: Stage, subject: Subject, memory: HashMemory) -> dict[st
         inputs[VIDEO_INPUT] = hash_value([subject.video_name(), files])
         if subject.chart != AUTO:
             inputs[CHART_INPUT] = hash_value(asdict(subject.chart))
+        if subject.grey is not None:
+            inputs[GREY_INPUT] = hash_value(list(subject.grey))
     for name in stage.given:
         if (file := getattr(subject, name)) is not None:
             inputs[name] = hash_value([memory.hash(file), name == "poses" and subject.hold_poses])

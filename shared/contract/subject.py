@@ -9,6 +9,7 @@ from pathlib import Path
 from shared.contract.chart_place import AUTO, ChartPlace, parse_chart
 from shared.contract.confine import check_link, inside
 from shared.contract.declare import Parameter
+from shared.contract.grey_place import parse_grey
 from shared.contract.wording import Anything, check_keys, nearest, read_yaml, unknown_name
 from shared.errors import InputError, shown
 
@@ -30,7 +31,8 @@ _HEAD = (
     Parameter("pupil_distance_mm", float, None, "Distance of the pupils of eyes that look far away.", "mm", 40.0, 90.0),
 )
 _CLIP_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}\Z")
-_OF_A_CLIP, _OF_ALL = ("video", "camera", "colour", "tracking", "chart"), ("clips", "capture", "head")
+_OF_A_CLIP = ("video", "camera", "colour", "tracking", "chart", "grey")
+_OF_ALL = ("clips", "capture", "head")
 _NEW = "make a subject with: limn new CLIP"
 
 
@@ -39,10 +41,10 @@ class Subject:
     """Facts of subject.yaml. video: absolute path of the file, or of an image sequence with a counter (%05d).
 
     focal_length_px: of the source frame; None with focal_length_mm also None means: estimate it. landmarks, poses:
-    files of another tracker; hold_poses: whether its poses stay as they are. chart: where a colour chart is.
-    pupil_distance_mm: of eyes that look far away, which sets the head's size; None: it is estimated. clips: of several
-    clips of one head under different lights each as a subject of its own, named as in subject.yaml; all else is
-    the first one's then.
+    files of another tracker; hold_poses: whether its poses stay as they are. chart: where a colour chart is. grey: a
+    grey place (x, y) px of the source frame, in the light of the face; None: none is named. pupil_distance_mm: of eyes
+    that look far away, which sets the head's size; None: it is estimated. clips: of several clips of one head under
+    different lights each as a subject of its own, named as in subject.yaml; all else is the first one's then.
     """
 
     folder: Path
@@ -57,6 +59,7 @@ class Subject:
     poses: Path | None = None
     hold_poses: bool = False
     chart: ChartPlace = AUTO
+    grey: tuple[float, float] | None = None
     pupil_distance_mm: float | None = None
     clips: tuple[Subject, ...] = ()
 
@@ -140,7 +143,7 @@ def _load(folder: Path) -> Subject:
 def _clips(content: dict, path: Path) -> list[tuple[str, dict]]:
     """Names and settings of the clips; what they leave out of camera and colour the whole subject says."""
     where = f"{path}: clips"
-    for key in ("video", "tracking", "chart"):
+    for key in ("video", "tracking", "chart", "grey"):
         if content.get(key) is not None:
             raise InputError(f"both {key} and clips", where=str(path),
                              hint=f"move {key} to where it belongs: clips: {{NAME: {{{key}: ...}}}}")
@@ -163,9 +166,11 @@ def _clip(folder: Path, name: str, content: dict, moves: str, where: str) -> Sub
     transfer = _choice(colour.get("transfer", "srgb"), TRANSFERS, f"{where}colour.transfer")
     given = _tracking(folder, content.get("tracking"), f"{where}tracking")
     chart = parse_chart(content.get("chart"), f"{where}chart")
+    grey = parse_grey(content.get("grey"), moves, f"{where}grey")
     head = check_keys(content.get("head"), [p.name for p in _HEAD], f"{where}head")
     head = {p.name: p.parse(head.get(p.name), f"{where}head.{p.name}") for p in _HEAD}
-    subject = Subject(folder, name, video, transfer=transfer, moves=moves, chart=chart, **camera, **given, **head)
+    subject = Subject(folder, name, video, transfer=transfer, moves=moves, chart=chart, grey=grey,
+                      **camera, **given, **head)
     _check_files(subject)
     return subject
 

@@ -50,6 +50,9 @@ def test_clips_take_from_the_subject_what_they_do_not_say(tmp_path):
 @pytest.mark.parametrize(("settings", "said"), [
     ("video: clip.txt\n" + CLIPS, "both video and clips"),
     ("chart: off\n" + CLIPS, "move chart to where it belongs: clips: {NAME: {chart: ...}}"),
+    ("grey: [9, 6]\n" + CLIPS, "move grey to where it belongs: clips: {NAME: {grey: ...}}"),
+    ("capture: {moves: camera}\n" + CLIPS.replace("lamp.txt", "lamp.txt, grey: [9, 6]"),
+     "clips.lamp.grey: a grey place before a camera that moves"),
     (CLIPS.replace("sun", "Sun"), "not a clip's name"),
     (CLIPS.replace("sun:", "1:"), "not a clip's name"),
     (CLIPS.replace("sun", "../sun"), "not a clip's name"),

@@ -169,6 +169,24 @@ def test_where_a_chart_is_matters_to_the_stage_that_reads_the_clip_alone(tmp_pat
     assert inputs(later, place) == inputs(later, "auto")
 
 
+def test_where_a_grey_place_is_matters_to_the_stage_that_reads_the_clip_alone(tmp_path):
+    folder = make_subject(tmp_path / "eve", settings="video: clip.txt\n")
+    outputs = (Output("text.txt", "the text"),)
+    first, later = Stage("sample", 1, "Samples.", (), outputs), Stage("track", 1, "Tracks.", ("sample",), outputs)
+
+    def inputs(stage, line):
+        (folder / "subject.yaml").write_text(f"video: clip.txt\n{line}\n")
+        return source_inputs(stage, load_subject(folder), HashMemory(tmp_path / "hashes.json"))
+
+    assert load_subject(folder).grey is None and set(inputs(first, "")) == {"subject.yaml", "video"}
+    named = inputs(first, "grey: [9, 6.5]")
+    assert load_subject(folder).grey == (9.0, 6.5)
+    assert set(named) == {"subject.yaml", "video", "grey"} and named.items() > inputs(first, "").items()
+    assert named["grey"] != inputs(first, "grey: [9, 6]")["grey"]
+    assert inputs(first, "grey: [9, 6]") == inputs(first, "grey: [9.0, 6.0]")
+    assert inputs(later, "grey: [9, 6.5]") == inputs(later, "")
+
+
 def test_declaration_is_read_without_the_stage_s_imports(tmp_path):
     source = ("import no_such_package\nfrom shared.contract import Stage, Output\nSIZES = (1, 2)\nLAST = SIZES[-1]\n"
               "STAGE = Stage('draw', LAST, 'Draws.', (), (Output('a', 'b'),))\nX = no_such_package.thing()\n")
