@@ -6,8 +6,9 @@ Writes   frames.json, frames/%06d.png (the crop in the source's own code values)
 Method   A first pass looks at several times as many frames as wanted, in small: follows the faces, and measures
          sharpness and change against the neighbours. Faulty, black, alien, faceless, repeated and blurred frames go,
          each with its reason; the rest is thinned to an even spacing in time. One crop holds the whole head in all of
-         them. A second pass decodes just these frames in full, and looks for a colour chart in a dozen of them. Codes
-         are stored as they are and linearised when read: rounding linear light to integers would lose the shadows.
+         them. A second pass decodes just these frames in full, and looks for a colour chart in a dozen of them, and at
+         the grey place that a person named. Codes are stored as they are and linearised when read: rounding linear
+         light to integers would lose the shadows.
 Fails    nothing can be decoded; no face is found; fewer than three frames are usable.
 """
 
@@ -57,6 +58,7 @@ def run(job: Job) -> None:
     from shared.capture.sample_clip import select_frames, survey_clip
     from shared.compute.processor import use_baseline_opencv
     from shared.io.arrays import write_json
+    from shared.io.images import write_png
     from shared.io.video import open_video
     from shared.tracking.models import load_face_networks
 
@@ -64,7 +66,7 @@ def run(job: Job) -> None:
     subject, params = job.subject, job.params
     reader, networks = open_video(subject.video, subject.transfer), load_face_networks()
     info = reader.info
-    chart = watch_for_chart(reader, job.subject)
+    chart, grey = watch_for_chart(reader, subject), watch_grey_place(reader, subject)
     candidates = params.frame_count * params.candidates
     survey = survey_clip(reader, networks, subject.transfer, candidates, job.progress)
     selection = select_frames(survey, info, str(subject.video), frame_count=params.frame_count,
@@ -73,9 +75,11 @@ def run(job: Job) -> None:
     job.note(selection.summary)
     intrinsics, focal_known, focal_warning = source_intrinsics(
         info, subject.focal_length_px, subject.focal_length_mm, subject.sensor_width_mm)
-    records, picture_warnings = write_frames(reader, selection, chart, job)
+    records, picture_warnings = write_frames(reader, selection, [chart, grey], job)
     warnings = [*info.warnings, *transfer_warnings(info.transfer_tag, subject.transfer), *selection.warnings,
-                *picture_warnings, *chart.warnings(), *[focal_warning] * (not focal_known)]
+                *picture_warnings, *chart.warnings(), *grey.warnings(), *[focal_warning] * (not focal_known)]
+    if chart.picture is not None:
+        write_png(job.out / "chart.png", chart.picture)
     write_json(job.out / "frames.json", {
         "source": {"name": subject.video.name, "width": info.width, "height": info.height, "fps": info.fps,
                    "frame_count": info.frame_count, "codec": info.codec, "rotation_deg": info.rotation},
@@ -87,6 +91,7 @@ def run(job: Job) -> None:
         "intrinsics_source": intrinsics.tolist(),
         "focal_known": focal_known,
         "chart": chart.record(),
+        **({"grey": said} if (said := grey.record()) else {}),
         "frames": records,
         "dropped": selection.dropped,
         "warnings": warnings,
@@ -120,8 +125,20 @@ def watch_for_chart(reader, subject: Subject):
     return chart
 
 
-def write_frames(reader, selection, chart, job: Job) -> tuple[list[dict], list[str]]:
-    """The second pass: crops, masks and the contact sheet -> one record per frame, and warnings."""
+def watch_grey_place(reader, subject: Subject):
+    """A GreyWatch for the second pass; InputError where the place lies outside the picture."""
+    from shared.capture.grey_watch import GreyWatch
+
+    size = reader.info.width, reader.info.height
+    if any(not 0 <= value <= size[axis] for axis, value in enumerate(subject.grey or ())):
+        raise InputError("a place outside the picture", where=f"{subject.folder / 'subject.yaml'}: grey",
+                         got=list(subject.grey), expected=f"inside {size[0]} x {size[1]} px")
+    return GreyWatch(subject.grey, subject.transfer)
+
+
+def write_frames(reader, selection, watches, job: Job) -> tuple[list[dict], list[str]]:
+    """The second pass: crops, masks and the contact sheet -> one record per frame, and warnings. watches: what looks at
+    the whole frames as they pass by: ChartWatch, GreyWatch."""
     from shared.capture.crop_pixels import area_average, clipped_share, display_codes, frame_mask, is_grey
     from shared.capture.framing import face_height
     from shared.compute.parallel import in_order
@@ -135,11 +152,13 @@ def write_frames(reader, selection, chart, job: Job) -> tuple[list[dict], list[s
         (job.out / folder).mkdir(parents=True, exist_ok=True)
     crop, transfer, count = selection.crop, job.subject.transfer, len(selection.frame_index)
     sheet, records, clipped, grey, detail = ContactSheet(count), [], [], [], ClipDetail(count)
-    chart.expect(count)
+    for watch in watches:
+        watch.expect(count)
 
     def cut_out(i: int, frame):
         whole = frame.codes()
-        chart.look(i, frame.index, whole)
+        for watch in watches:
+            watch.look(i, frame.index, whole)
         part = whole[crop.y0:crop.y0 + crop.height, crop.x0:crop.x0 + crop.width].copy()
         points = (selection.landmarks[i][:, :2] - (crop.x0, crop.y0)) * crop.scale
         return i, part, points, frame_record(frame.index, frame.time_s, points, selection.sharpness[i])
@@ -162,8 +181,6 @@ def write_frames(reader, selection, chart, job: Job) -> tuple[list[dict], list[s
         grey.append(is_frame_grey)
         sheet.add(rgb, mask)
     write_png(job.out / "contact_sheet.png", sheet.picture())
-    if chart.picture is not None:
-        write_png(job.out / "chart.png", chart.picture)
     warnings = []
     if np.mean(clipped) > CLIPPED_WARNING:
         warnings.append(f"{np.mean(clipped):.0%} of the face is overexposed: expose it darker")

@@ -70,6 +70,14 @@ FRAMES = (
     Field("chart[].glare", "Linear value that a reflection adds to every patch.", shape="3"),
     Field("chart[].weight", "Weight of each patch, 0 to 1.", shape="24"),
     Field("chart[].relative_error", "Relative error of the grey patches and of the coloured ones.", shape="2"),
+    Field("grey", "What the place shows that `subject.yaml` names as grey; absent where none is named, or it is "
+          "not used.", "", optional=True),
+    Field("grey.place", "The place in the source.", shape="2", unit="px"),
+    Field("grey.colour", "Its linear colour: the median over the frames.", shape="3"),
+    Field("grey.log_sigma", "Standard deviation over the frames of log red/green and log blue/green, by the median "
+          "absolute deviation.", shape="2"),
+    Field("grey.frames", "The frames that count: neither overexposed nor too dark there, and of one colour.", "int",
+          "F"),
     Field("warnings", "What is wrong with the clip, one sentence each.", "text", "N"),
 )
 

@@ -21,7 +21,8 @@ class FrameSet:
     """F frames of one clip, cropped: u_crop = (u_source - x0) * scale, pixel centres at integer + 0.5.
 
     frame_index [F] counts the source's frames; intrinsics [3, 3] belong to the crop, intrinsics_source to the full
-    frame; size and source_size are (width, height). chart: what a colour chart says, see ChartWatch.record.
+    frame; size and source_size are (width, height). chart: what a colour chart says, see ChartWatch.record;
+    grey: what a grey place does, see GreyWatch.record, None without one.
     """
 
     folder: Path
@@ -40,6 +41,7 @@ class FrameSet:
     transfer: str
     moves: str
     chart: tuple[dict, ...] = ()
+    grey: dict | None = None
 
     @classmethod
     def open(cls, folder: Path | str) -> FrameSet:
@@ -69,6 +71,7 @@ class FrameSet:
             transfer=content["transfer"],
             moves=content["moves"],
             chart=tuple(content.get("chart", ())),
+            grey=content.get("grey"),
         )
 
     @property

@@ -18,6 +18,9 @@ _ADVICE = (
     (r"colour chart",
      "Look at work/sample_frames/chart.png. The chart should face the camera in the light of the face, without "
      "overexposed patches or the head's shadow; or give its corners by `chart:` in subject.yaml."),
+    (r"grey place",
+     "Name by `grey:` in subject.yaml a place of plain grey or white in the light of the face that is well exposed and "
+     "that nobody walks before, or leave it out."),
     (r"tracks ask for a focal length",
      "Correct the lens in subject.yaml; cropping and stabilisation in the camera lengthen it too."),
     (r"beside the shared mesh",

@@ -72,9 +72,14 @@ def chart_outside(folder):
     return make(folder, settings=GOOD + "chart: {frame: 3, corners: [[9, 9], [900, 9], [900, 60], [9, 60]]}\n")
 
 
+def grey_outside(folder):
+    return make(folder, settings=GOOD + "grey: [9, 900]\n")
+
+
 @pytest.mark.parametrize("spoil, hint", [
     (nothing, "no face found"), (cut_off, "cut off or damaged"), (sound, "no video stream"), (text, "not a video"),
-    (chart_beyond, "the clip has no such frame"), (chart_outside, "corners outside the picture")])
+    (chart_beyond, "the clip has no such frame"), (chart_outside, "corners outside the picture"),
+    (grey_outside, "a place outside the picture")])
 def test_the_stage_and_validate_say_the_same(tmp_path, capsys, spoil, hint):
     subject = spoil(tmp_path / "anna")
     before = tree(subject)

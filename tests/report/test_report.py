@@ -286,6 +286,7 @@ def test_gathering_of_warnings_and_left_out_frames(tmp_path):
         ("the background stands still while the head turns by 60 degrees, so the head moved: set capture.moves to head",
          "Correct capture.moves"),
         ("the colour chart in frame 6 is not used: its grey patches are overexposed: expose darker", "chart.png"),
+        ("the grey place at (12, 30) is not used: its red is 3.20 and its blue 0.90 times its green", "nobody walks"),
         ("3 edges join faces of opposite winding", "Clean the mesh"),
         ("clip sun lies 2.1 px beside the shared mesh: other lens, another expression?", "its own lens"),
     ],

@@ -198,6 +198,30 @@ def test_a_person_says_where_the_chart_is_or_that_there_is_none(tmp_path, subjec
         assert error.count("\n") == 1 and words in error
 
 
+def test_a_person_names_a_grey_place(tmp_path, subject, capsys):
+    """The drawn wall is bluish at the left, and a sign is held before it in some frames."""
+    frames = turning_face(8)
+    frames[3][80:100, 2:20] = (190, 60, 40)
+    video = write_video(tmp_path / "clip.mp4", frames, pixel_format="yuv444p")
+    code, out = subject(video)
+    assert code == 0 and "grey" not in frames_json(out) and FrameSet.open(out).grey is None
+    plain = (out / "frames.json").read_text()
+    code, out = subject(video, yaml="camera: {focal_length_px: 900}\ngrey: [8, 90]\n")
+    content = frames_json(out)
+    assert code == 0 and field_faults(content, FRAMES) == []
+    said = content.pop("grey")
+    assert FrameSet.open(out).grey == said and content == json.loads(plain)
+    assert said["frames"] == [frame["frame_index"] for frame in content["frames"] if frame["frame_index"] != 3]
+    np.testing.assert_allclose(said["colour"], decode_srgb(np.array([61, 71, 81]) / 255), rtol=0.06)
+    code, out = subject(video, yaml="grey: [120, 95]\n")
+    assert code == 0 and "grey" not in frames_json(out)
+    assert any("the grey place at (120, 95) is not used" in text for text in frames_json(out)["warnings"])
+    capsys.readouterr()
+    assert subject(video, yaml="grey: [8, 201]\n")[0] == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "grey: a place outside the picture" in error and "240 x 200 px" in error
+
+
 class SidewaysNetworks(DrawnFaceNetworks):
     """Sure of a face only when the picture is higher than wide."""
 

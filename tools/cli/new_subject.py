@@ -31,6 +31,9 @@ capture: {{moves: {moves}}}
 
 # A 24-patch colour chart in view is found by itself; by hand, or to leave it out:
 # chart: {{frame: 0, corners: [[x, y], [x, y], [x, y], [x, y]]}}   # or off
+
+# A place on a grey wall or card, in the light of the face, tells the light's tint (px; not where the camera moves):
+# grey: [x, y]
 """
 
 

@@ -21,7 +21,7 @@ from shared.io.image_sequence import ImageSequenceReader
 from shared.io.video import VideoReader, open_video
 from shared.tracking.given_tracking import read_given_landmarks, read_given_poses
 from shared.tracking.models import load_face_networks
-from stages.sample_frames import STAGE, transfer_warnings, watch_for_chart
+from stages.sample_frames import STAGE, transfer_warnings, watch_for_chart, watch_grey_place
 
 LOOKS = 24
 """Frames in which a face is looked for at first."""
@@ -68,6 +68,7 @@ def _look_at(name: str, clip: Subject, networks: FaceNetworks) -> Findings:
         info, clip.focal_length_px, clip.focal_length_mm, clip.sensor_width_mm)
     _read_given(clip, info.frame_count)
     watch_for_chart(reader, clip)
+    watch_grey_place(reader, clip)
     height_px = _face_height_px(reader, clip, networks)
     facts = (f"{info.width} x {info.height} px, {info.frame_count} frames, {info.fps:.4g} frames/s, {info.codec}; "
              f"focal length {intrinsics[0, 0]:.0f} px{'' if is_known else ' (not given)'}; "
