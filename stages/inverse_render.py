@@ -124,8 +124,8 @@ STAGE = Stage(
         Parameter("local_roughness", bool, True, "Let roughness vary over the skin where held-out frames gain by it."),
         Parameter("specular_prior", float, 0.7, "Expected specular intensity of skin; index of refraction 1.4: 0.7.",
                   "", 0.01, 2.0),
-        Parameter("light_colour_sigma", float, 0.15, "Expected deviation of the light's log colour ratios from grey.",
-                  "", 0.01, 2.0, former="white_light"),
+        Parameter("light_colour_sigma", float, 0.15, "Expected deviation of the light's log colour ratios from grey, "
+                  "where `grey` in `subject.yaml` does not tell them.", "", 0.01, 2.0, former="white_light"),
         Parameter("skin_brightness_sigma", float, 0.2, "Expected deviation of the log albedo's brightness at large "
                   "scale over the skin of a face.", "", 0.01, 10.0, former="skin_brightness"),
         Parameter("skin_colour_sigma", float, 0.1, "The same of its colour, per channel about their mean.", "",
@@ -313,7 +313,7 @@ def run(job: Job) -> None:
         placed = [{"name": name, **facts} for name, facts in zip(job.clips, inputs.describe(), strict=True)]
         job.note(f"clips in one head space: {placed}")
     observations = inputs.chart_observations() if job.params.chart else ()
-    settings = read_settings(job.params, job.out.parent / CHECKPOINT)
+    settings = read_settings(job.params, job.out.parent / CHECKPOINT, inputs.light_tints())
     views, surface = inputs.views, inputs.surface
     tracked = None if job.clips else inputs.tracked
     result = solve_clip(views, surface, settings, RunContext(job.progress, job.note), observations, tracked)

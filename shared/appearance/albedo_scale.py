@@ -1,12 +1,13 @@
 """The factor per colour channel between light and albedo: what the clip cannot say, said by stated priors, and by the
-whites of the eyes or a colour chart where they are in view.
+whites of the eyes, a grey place or a colour chart where they are in view.
 
 Twice the light on half the albedo gives the same diffuse picture. Three statements fix the factor, each a normal
 distribution over logarithms, and the whites of the eyes (eye_whites) and a chart (chart_scale) are others:
 
 - skin's luminance: log Y is normal with the median and the spread of reference skins of all tones;
 - skin's chroma lies on the locus of measured skins: log R/G and log B/G are linear in log Y, sigma as found there;
-- the light on the skin is white after the camera's own white balance: log R/G and log B/G ~ N(0, 0.15).
+- the light on the skin is white after the camera's own white balance: log R/G and log B/G ~ N(0, 0.15); or has the
+  tint that a grey place shows (light_tint), where one is named.
 
 A fourth only keeps the skin's brightest places from returning more than the lightest reference skin.
 
@@ -19,12 +20,14 @@ offer; ColorChecker patches "light skin" and "dark skin" (sRGB values of X-Rite,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
+from shared.appearance.light_tint import LightTint
 from shared.imaging.color import LUMINANCE
 
 REFERENCE_SKINS = np.array(
@@ -116,10 +119,12 @@ def scale_prior(
     white_sigma: float = WHITE_SIGMA,
     locus: SkinLocus | None = None,
     relative_light: np.ndarray | None = None,
+    tints: Sequence[LightTint | None] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
     """The priors as residuals A u - b of unit variance in u = log mean irradiance [3], given y = log_radiance [3].
 
-    relative_light [L, 3]: log irradiance of several lights relative to u; each is expected to be white by itself.
+    relative_light [L, 3]: log irradiance of several lights relative to u; each is expected to be white by itself, or to
+    have its own tint where that was measured. tints: of the L lights, None where nothing is known; empty: of none.
     Luminance enters linearised: d log Y = sum_c share_c d log a_c, with the shares of a typical skin.
     """
     locus = locus or fit_skin_locus()
@@ -137,14 +142,22 @@ def scale_prior(
     on_skin = -rows / sigmas[:, None]
     right = (targets - rows @ log_radiance) / sigmas
     relative = np.zeros((1, 3)) if relative_light is None else relative_light
-    white = [ratio / white_sigma] * len(relative)
-    return np.concatenate([on_skin, *white]), np.concatenate([right, (-relative @ ratio.T).ravel() / white_sigma])
+    white = LightTint((0.0, 0.0), (white_sigma, white_sigma))
+    expected = [tint or white for tint in tints] or [white] * len(relative)
+    of_light = [ratio / np.array(tint.sigma)[:, None] for tint in expected]
+    wanted = [(tint.log_ratios - ratio @ own) / tint.sigma for tint, own in zip(expected, relative, strict=True)]
+    return np.concatenate([on_skin, *of_light]), np.concatenate([right, *wanted])
 
 
-def most_likely_irradiance(log_radiance: np.ndarray, white_sigma: float = WHITE_SIGMA) -> np.ndarray:
+def most_likely_irradiance(
+    log_radiance: np.ndarray,
+    white_sigma: float = WHITE_SIGMA,
+    relative_light: np.ndarray | None = None,
+    tints: Sequence[LightTint | None] = (),
+) -> np.ndarray:
     """u [3]: the log mean irradiance that the priors alone prefer for skin of log mean radiance y [3]. log_radiance
-    [3]."""
-    matrix, right = scale_prior(log_radiance, white_sigma)
+    [3]; relative_light [L, 3], tints: see scale_prior."""
+    matrix, right = scale_prior(log_radiance, white_sigma, relative_light=relative_light, tints=tints)
     return np.linalg.lstsq(matrix, right, rcond=None)[0]
 
 
@@ -158,21 +171,24 @@ def resolve_scale(
     relative_light: np.ndarray | None = None,
     log_brightest: np.ndarray | None = None,
     whites: tuple[np.ndarray, np.ndarray] | None = None,
+    tints: Sequence[LightTint | None] = (),
 ) -> ResolvedScale:
     """The factor on the light per channel and the specular intensity that are jointly most likely.
 
     The lobe returns the light's own colour and its strength has a known range, so highlights say something about the
     scale that diffuse skin cannot: with the light multiplied by k, channel c wants s k_c = t_c. log_albedo,
     log_irradiance [3] are the skin's present means; specular_prior: mean of s and standard deviation of its logarithm;
-    chart: the log factor [3] on the light that a colour chart asks for, and its covariance [3, 3]; relative_light: see
-    scale_prior; log_brightest [3]: log of the skin's present albedo at the quantile BRIGHTEST, None: it is not asked;
-    whites: as chart, of the whites of the eyes.
+    chart: the log factor [3] on the light that a colour chart asks for, and its covariance [3, 3]; relative_light and
+    tints: see scale_prior; log_brightest [3]: log of the skin's present albedo at the quantile BRIGHTEST, None: it is
+    not asked; whites: as chart, of the whites of the eyes.
     With a chart the highlights give s alone: on the scale their range has little to add, and the model's errors pass
     for highlights.
     -> log k [3], and s, the prior's mean without highlights; covariances are Laplace's approximation.
     """
-    matrix, right = scale_prior(log_albedo + log_irradiance, white_sigma, relative_light=relative_light)
+    log_radiance = log_albedo + log_irradiance
+    matrix, right = scale_prior(log_radiance, white_sigma, relative_light=relative_light)
     prior_covariance = np.linalg.inv(matrix.T @ matrix)
+    matrix, right = scale_prior(log_radiance, white_sigma, relative_light=relative_light, tints=tints)
     for wanted, covariance in filter(None, (chart, whites)):
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
         matrix = np.concatenate([matrix, whitening])

@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 
 from shared.appearance.albedo_scale import ResolvedScale, most_likely_irradiance
+from shared.appearance.light_tint import LightTint, describe_tints, tint_in_words
 from shared.capture.chart import COLUMNS, CORNERS, GLARE_SIGMA, PATCHES, ChartObservation, reflectances
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import WORLD_FROM_CAMERA, fibonacci_sphere, invert_rigid, pixel_rays
@@ -217,15 +218,19 @@ def chart_normals(corners: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarr
 
 
 def describe_scale(
-    chart: ChartStatement | None, skin: np.ndarray, whites: dict | None = None, scale: ResolvedScale | None = None
+    chart: ChartStatement | None,
+    skin: np.ndarray,
+    whites: dict | None = None,
+    scale: ResolvedScale | None = None,
+    tints: Sequence[LightTint | None] = (),
 ) -> dict:
     """albedo_scale of solve.json: what set the scale, and the skin's albedo [3] under it; whites: what the whites of
-    the eyes said, None: nothing; scale: with its covariance, None: unknown.
+    the eyes said, None: nothing; scale: with its covariance, None: unknown; tints: what grey places said of each light.
 
     With a chart also what it said: the frames, the irradiance over pi on it, the deviation of its logarithm, and by
     which factor the albedo would be another by the priors alone (without highlights and whites).
     """
-    priors = "luminance and chroma of reference skins, a light that is white on average"
+    priors = f"luminance and chroma of reference skins, {tint_in_words(tints)}"
     if whites is not None:
         priors += ", whites of the eyes that are nearly neutral and as bright as usual"
     alone = f"priors: {priors}, and the strength of highlights relative to their usual range"
@@ -235,13 +240,15 @@ def describe_scale(
         "skin_luminance": round(float(skin @ LUMINANCE), 4),
         **({} if scale is None else scale.describe(skin)),
         **({} if whites is None else {"whites": whites}),
+        **({"grey": said} if (said := describe_tints(tints)) else {}),
     }
     if chart is None:
         return described
     observations = [view.observation for view in chart.views]
     white, sigma = (np.median([getattr(observation, name) for observation in observations],
                               axis=0) for name in ("white", "log_sigma"))
-    factor = white / np.exp(most_likely_irradiance(np.log(skin * white)))
+    own = tints[chart.light : chart.light + 1]
+    factor = white / np.exp(most_likely_irradiance(np.log(skin * white), tints=own))
     return described | {"chart": {
         "frames": [observation.frame_index for observation in observations],
         "irradiance_over_pi": np.round(white, 4).tolist(),

@@ -13,7 +13,7 @@ said to mean:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +21,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from shared.appearance.albedo_scale import scale_prior
+from shared.appearance.light_tint import LightTint
 from shared.appearance.problem import AppearanceProblem, AppearanceState
 from shared.appearance.sample_errors import SampleErrors
 from shared.compute.robust import ROBUST_SCALE
@@ -66,12 +67,13 @@ def diagnostics_of(
     gains, residual = frame_gains(part.errors, model), normalised_residuals(part.errors, model)
     weight = part.skin_weight
     radiance = ((weight * part.errors.colours).sum((1, 2)) / weight.sum()).double().numpy()
+    relative = np.log(part.skin_radiance()[1]) if settings.tints else None
     skin = capture.skin
     diagnostics = {
         "frame_gain": gains.mean(1).std(),
         "frame_tint": (gains[:, 0] - gains[:, 2]).std(),
         "albedo_by_orientation": by_orientation(state.albedo[skin], capture.points.normals[skin]),
-        "unlikely_colour": unlikely_colour(radiance, settings.white_sigma),
+        "unlikely_colour": unlikely_colour(radiance, settings.white_sigma, relative, settings.tints),
         **{f"covered_{name}": covered_share(residual, region[some]) for name, region in (regions or {}).items()},
     }
     return {name: round(float(value), 4) for name, value in diagnostics.items()}
@@ -143,7 +145,14 @@ def by_orientation(albedo: np.ndarray, normals: np.ndarray) -> float:
     return float(np.sqrt(np.average(np.square(shaded - mean), weights=weight)))
 
 
-def unlikely_colour(radiance: np.ndarray, white_sigma: float) -> float:
-    """Root of what is left of the priors' squared residuals for skin of mean radiance [3] under the best light."""
-    matrix, right = scale_prior(np.log(np.maximum(radiance, 1e-6)), white_sigma)
+def unlikely_colour(
+    radiance: np.ndarray,
+    white_sigma: float,
+    relative_light: np.ndarray | None = None,
+    tints: Sequence[LightTint | None] = (),
+) -> float:
+    """Root of what is left of the priors' squared residuals for skin of mean radiance [3] under the best light;
+    relative_light [L, 3], tints: see scale_prior."""
+    log_radiance = np.log(np.maximum(radiance, 1e-6))
+    matrix, right = scale_prior(log_radiance, white_sigma, relative_light=relative_light, tints=tints)
     return float(np.linalg.norm(matrix @ np.linalg.lstsq(matrix, right, rcond=None)[0] - right))

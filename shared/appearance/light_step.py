@@ -287,6 +287,7 @@ class LinearisedFit:
         scale = resolve_scale(
             log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart=chart,
             relative_light=relative, log_brightest=problem.brightest_skin(albedo), whites=problem.said_by_whites(state),
+            tints=settings.tints,
         )
         log_factor = scale.log_factor
         factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]

@@ -29,6 +29,7 @@ from shared.appearance.albedo_scale import BRIGHTEST, most_likely_irradiance
 from shared.appearance.eye_whites import whites_statement
 from shared.appearance.light import FrameLight, LightPriors
 from shared.appearance.light_models import LightModel, make_light_model
+from shared.appearance.light_tint import LightTint
 from shared.appearance.observations import Capture
 from shared.appearance.sample_errors import SampleErrors
 from shared.appearance.skin_prior import SkinPrior, SkinVariation
@@ -51,8 +52,9 @@ PATCH_MM = 50.0
 class AppearanceSettings:
     """light_model: see light_models; resolutions: cubemap edge per stage of the solve; independent: how many of the
     samples count as independent evidence against the priors; noise: absolute (linear) and relative standard deviation
-    of a sample; visibility: whether parts of the head cover each other; precision: most products of a step of the
-    light, and by how much its residual must fall; coarse_points: see fit.fit_all_points, 0: all."""
+    of a sample; white_sigma, tints: see albedo_scale.scale_prior; visibility: whether parts of the head cover each
+    other; precision: most products of a step of the light, and by how much its residual must fall; coarse_points: see
+    fit.fit_all_points, 0: all."""
 
     light_model: str = "cubemap"
     resolutions: tuple[int, ...] = (8, 16)
@@ -61,6 +63,7 @@ class AppearanceSettings:
     noise: tuple[float, float] = (0.006, 0.03)
     priors: LightPriors = field(default_factory=LightPriors)
     white_sigma: float = 0.15
+    tints: tuple[LightTint | None, ...] = ()
     skin: SkinVariation | None = field(default_factory=SkinVariation)
     visibility: bool = True
     bounce: bool = True
@@ -225,14 +228,13 @@ class AppearanceProblem:
         """Uniform lights of the level that the priors prefer for this radiance."""
         errors, settings = self.errors, self.settings
         weight = self.skin_weight.double()
-        radiance = ((weight * errors.colours).sum((1, 2)) / weight.sum()).numpy()
-        levels = [(weight * errors.colours)[..., own].sum((1, 2)).numpy() / weight[..., own].sum().item() / radiance
-                  for own in errors.light_frames]
+        radiance, levels = self.skin_radiance()
         open_share = float((self.direct.sum(1) * weight[0].sum(1)).sum() / weight.sum())
-        irradiance = np.exp(most_likely_irradiance(np.log(radiance), settings.white_sigma))
+        relative = np.log(levels) if settings.tints else None
+        irradiance = np.exp(most_likely_irradiance(np.log(radiance), settings.white_sigma, relative, settings.tints))
         albedo = radiance / irradiance
         model, resolution = settings.light_schedule[0]
-        log_light = np.repeat(np.log(irradiance / open_share * np.array(levels)), 6 * resolution**2, axis=0)
+        log_light = np.repeat(np.log(irradiance / open_share * levels), 6 * resolution**2, axis=0)
         start = AppearanceState(
             params=log_light,
             light_model=make_light_model("cubemap", resolution, len(errors.light_frames)),
@@ -327,6 +329,14 @@ class AppearanceProblem:
     def skin_weight(self) -> torch.Tensor:
         """[1, P, F]: the samples' view weights, 0 beside the skin."""
         return self.errors.view_weight * torch.from_numpy(self.capture.skin.astype(np.float32))[None, :, None]
+
+    def skin_radiance(self) -> tuple[np.ndarray, np.ndarray]:
+        """[3]: the skin's mean radiance in all frames, and [L, 3]: that in the frames of each light relative to it."""
+        errors, weight = self.errors, self.skin_weight.double()
+        radiance = ((weight * errors.colours).sum((1, 2)) / weight.sum()).numpy()
+        levels = [(weight * errors.colours)[..., own].sum((1, 2)).numpy() / weight[..., own].sum().item() / radiance
+                  for own in errors.light_frames]
+        return radiance, np.array(levels)
 
     def typical_albedo(self, state: AppearanceState) -> torch.Tensor:
         """[3, 1, 1]: the skin points' median albedo."""

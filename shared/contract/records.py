@@ -281,6 +281,11 @@ _SCALE = (
     Field("albedo_scale.whites.albedo", "Their albedo.", shape="3"),
     Field("albedo_scale.whites.usual", "What it is in people, as it is measured here."),
     Field("albedo_scale.whites.log_sigma", "Standard deviation of its logarithm, as it was counted."),
+    Field("albedo_scale.grey", "What a grey place said of its light's tint, one entry for each light in which one is "
+          "named; absent without any.", "", optional=True),
+    Field("albedo_scale.grey[].light", "Which of several lights, from 0: the clips in their order.", "int"),
+    Field("albedo_scale.grey[].log_ratios", "Log red/green and log blue/green of the light.", shape="2"),
+    Field("albedo_scale.grey[].log_sigma", "Their standard deviations, as they were counted.", shape="2"),
     Field("albedo_scale.chart", "What a colour chart said; absent without one.", "", optional=True),
     Field("albedo_scale.chart.frames", "The frames in which it was read.", "int", "N"),
     Field("albedo_scale.chart.irradiance_over_pi", "Light on the chart.", shape="3"),

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shared.appearance.light_tint import LightTint
 from shared.capture.chart import ChartObservation
 from shared.compute.parallel import in_order
 from shared.errors import InputError
@@ -62,6 +63,11 @@ class ClipInputs:
         return tuple(
             ChartObservation.from_record(record, self.frames.crop, self.frame_index) for record in self.frames.chart
         )
+
+    def light_tints(self) -> tuple[LightTint | None, ...]:
+        """What a grey place says of the clip's one light; empty without one. A white balance that drifts about its mean
+        leaves the tint as it is: exposure's gains have a mean of 1, and the place is looked at in the whole clip."""
+        return () if self.frames.grey is None else (LightTint.from_record(self.frames.grey),)
 
 
 def read_inputs(sampled: Path, tracked: Path, mesh_path: str = "", pose_path: str = "") -> ClipInputs:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from shared.appearance.light_tint import LightTint
 from shared.capture.chart import ChartObservation
 from shared.errors import InputError
 from shared.geometry.eyeballs import gaze_direction, gaze_towards
@@ -57,6 +58,11 @@ class JoinedClips:
             if observations := clip.chart_observations():
                 return tuple(replace(seen, frame=seen.frame + int(own[0])) for seen in observations)
         return ()
+
+    def light_tints(self) -> tuple[LightTint | None, ...]:
+        """What a grey place in each clip says of that clip's own light, None without one; empty where none has one."""
+        tints = tuple(next(iter(clip.light_tints()), None) for clip in self.clips)
+        return tints if any(tints) else ()
 
     def describe(self) -> list[dict]:
         """Of each clip what solve.json says: whether the mesh is its own, else how its frames were placed on it."""

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from shared.appearance.light import LightPriors
+from shared.appearance.light_tint import LightTint
 from shared.appearance.problem import AppearanceSettings
 from shared.appearance.skin_prior import SkinVariation
 from shared.contract.job import Parameters
@@ -26,8 +27,11 @@ SPECULAR_SPREAD = 0.25
 """Standard deviation of the logarithm of people's mean specular intensity about the expected one."""
 
 
-def read_settings(params: Parameters, checkpoint: Path | None = None) -> InverseSettings:
-    """All settings; checkpoint: the reference solver's own file, or None. InputError for what cannot go together."""
+def read_settings(
+    params: Parameters, checkpoint: Path | None = None, tints: tuple[LightTint | None, ...] = ()
+) -> InverseSettings:
+    """All settings; checkpoint: the reference solver's own file, or None; tints: what grey places say of each light.
+    InputError for what cannot go together."""
     if params.model == "auto" and params.solver == "reference":
         raise InputError("model=auto belongs to solver=transfer", where="--set inverse_render.model",
                          hint="leave out one of the two; the reference solver takes visibility and specular as given")
@@ -38,6 +42,7 @@ def read_settings(params: Parameters, checkpoint: Path | None = None) -> Inverse
         independent=params.independent_samples,
         priors=LightPriors(smooth=params.light_smoothness),
         white_sigma=params.light_colour_sigma,
+        tints=tints,
         skin=SkinVariation(params.skin_brightness_sigma, params.skin_colour_sigma),
         visibility=params.visibility,
         bounce=params.bounce,

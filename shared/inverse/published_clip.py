@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from shared.appearance.albedo_scale import most_likely_irradiance
 from shared.appearance.chart_scale import describe_scale
 from shared.appearance.fit import Solution
 from shared.appearance.light_models import LogLight
+from shared.appearance.light_tint import LightTint
 from shared.appearance.maps import make_maps
 from shared.appearance.problem import AppearanceState
 from shared.appearance.texture import TexelMaterial
@@ -37,7 +38,6 @@ LARGEST_RESULT_LIGHT = 64
 SAMPLE_SPREAD = 0.04
 """Relative standard deviation of one sample: what the confidence map counts with."""
 REPORT_EVERY = 50
-SCALE = "priors on skin and white light where the descent starts, which nothing holds it to"
 
 
 @dataclass(frozen=True)
@@ -69,15 +69,22 @@ def average_texture(views: Views, viewer: SurfaceViewer, size: int, context: Run
     return Average(surface, np.maximum(colours, 1e-3), weight)
 
 
-def make_start(average: Average, skin: np.ndarray, white_sigma: float, specular: bool) -> Start:
-    """The mean texture under a uniform light of the level that the priors on skin prefer; skin [V] bool.
+def make_start(
+    average: Average,
+    skin: np.ndarray,
+    white_sigma: float,
+    specular: bool,
+    tints: Sequence[LightTint | None] = (),
+) -> Start:
+    """The mean texture under a uniform light of the level that the priors on skin prefer; skin [V] bool; white_sigma,
+    tints: see albedo_scale.scale_prior.
 
     The specular intensity starts as the grey of the albedo, as published.
     """
     surface = average.surface
     on_skin = skin[surface.mesh.faces[surface.face]].all(1) & (average.weight > 1e-3)
     radiance = np.median(average.colours[on_skin] if on_skin.any() else average.colours, axis=0)
-    irradiance = np.exp(most_likely_irradiance(np.log(radiance), white_sigma))
+    irradiance = np.exp(most_likely_irradiance(np.log(radiance), white_sigma, tints=tints))
     albedo = np.clip(average.colours / irradiance, 0.0, 1.0)
     grey = albedo.mean(1) if specular else np.zeros(len(albedo))
     albedo, grey = (surface.dilated(surface.to_image(values.astype(np.float32))) for values in (albedo, grey))
@@ -99,7 +106,8 @@ def solve_by_reference(
     some = views.take(index[spread_frames(len(index), START_FRAMES)])
     average = average_texture(some, viewer, settings.map_size, context)
     skin = surface.vertices_of(FACE_SKIN)
-    start = make_start(average, skin, settings.appearance.white_sigma, reference.sampling.specular)
+    start = make_start(average, skin, settings.appearance.white_sigma, reference.sampling.specular,
+                       settings.appearance.tints)
     moving = replace(fitted, moves=settings.appearance.light_moves(views.moves))
     solver = ReferenceSolver(surface.mesh, moving, start, reference)
     checkpoint = Checkpoint(reference, start, moving)
@@ -182,10 +190,13 @@ def conclude(
     held = fit if views.fitted.all() else residual(views, solver, np.nonzero(~views.fitted)[0])
     solution = Solution(state, tuple(_thinned(records)), fit, held)
     shading = shade_vertices(views, viewer, precomputed, appearance, solution, context)
+    tints = settings.appearance.tints
+    light = "the tint of a grey place" if tints else "white light"
+    method = f"priors on skin and {light} where the descent starts, which nothing holds it to"
     record = {
         "texture": {"held_out": {"per texel": held}, "chosen": "per texel",
                     "contradicted": {"held_out": {}, "chosen": ""}},
-        "albedo_scale": describe_scale(None, np.median(state.albedo, axis=0)) | {"method": SCALE},
+        "albedo_scale": describe_scale(None, np.median(state.albedo, axis=0), tints=tints) | {"method": method},
         "warnings": [],
     }
     materials = clip_materials(viewer, shading, views, surface, state, context)

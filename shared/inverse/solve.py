@@ -111,7 +111,7 @@ def solve_clip(
         "diagnostics": diagnostics,
         "warnings": [*filter(None, [chart_warning]), *scale_warnings(chart, typical),
                      *exposure_warnings(exposure), *diagnostic_warnings(diagnostics, views.moves)],
-        "albedo_scale": describe_scale(chart, typical, whites, solution.scale),
+        "albedo_scale": describe_scale(chart, typical, whites, solution.scale, settings.appearance.tints),
         "model_selection": () if selected is None else selected.candidates,
     }
     return InverseResult(solution, texels, views, record, covariance)

@@ -259,6 +259,9 @@ def _scale(records: RunRecords) -> Iterable[str]:
                "in view {Mccamy1976}.")
     elif "method" in scale:
         yield (f"The scale between light and albedo, which no clip tells by itself, was set by {scale['method']}.")
+    if "grey" in scale:
+        yield ("The light's tint was read where a person named a place in the picture as grey, whose brightness was "
+               "not used.")
     if "log_sigma" in scale:
         deviation = scale["log_sigma"]["luminance"]
         yield (f"By these the skin's luminance is known to {deviation:.0%} (standard deviation of the logarithm), "

@@ -82,6 +82,7 @@ ELSEWHERE = {
     "test_chart": {"frames.json: chart[]."},
     "test_chart_scale": {"albedo_scale.chart"},
     "test_grey_watch": {"frames.json: grey"},
+    "test_light_tint": {"albedo_scale.grey"},
     "test_exposure": {"solve.json: exposure", "poses.npz: gain"},
     "test_eye_whites": {"albedo_scale.whites"},
     "test_joint_clips": {"solve.json: clips", "run.json: clips", "clips/*/poses.npz: ", "iterations[].light_weights"},

@@ -12,6 +12,7 @@ from quick import QUICK, TINY
 from shapes import grid_plane, turned
 from toy_head import toy_head
 
+from shared.appearance.light_tint import LightTint
 from shared.contract.records import RUN, SOLVE, SOLVED_POSES
 from shared.errors import InputError
 from shared.geometry.mesh import interpolate, vertex_normals
@@ -60,10 +61,14 @@ class ToyInputs:
     views: Views
     surface: Surface
     charts: tuple = ()
+    tints: tuple = ()
     frames = SimpleNamespace(source_name="clip.avi")
 
     def chart_observations(self):
         return self.charts
+
+    def light_tints(self):
+        return self.tints
 
     def without_tracks(self):
         return replace(self, surface=replace(self.surface, tracks=None))
@@ -132,6 +137,14 @@ def test_given_meshes_share_a_head_space_already():
     joint = join_clips(clips, ())
     assert joint.main == 0 and joint.surface.tracks is None
     assert np.array_equal(joint.views.camera_from_head, np.concatenate([clip.views.camera_from_head for clip in clips]))
+
+
+def test_each_clip_says_what_its_own_grey_place_shows():
+    clips = [toy_clip(4, 0.3, 0.2, seed).without_tracks() for seed in range(3)]
+    assert join_clips(clips, ()).light_tints() == ()
+    tint = LightTint((0.3, -0.4), (0.06, 0.07))
+    clips[1] = replace(clips[1], tints=(tint,))
+    assert join_clips(clips, ()).light_tints() == (None, tint, None)
 
 
 def test_the_chart_of_the_first_clip_that_shows_one_counts():

@@ -68,6 +68,13 @@ def test_settings_change_the_text():
     assert "used poses that another tracker gave" in text
 
 
+def test_a_grey_place_gets_its_sentence():
+    said = {"light": 0, "log_ratios": [0.1, 0.0], "log_sigma": [0.06, 0.06]}
+    grey = {"method": "priors: skin's luminance", "grey": [said]}
+    assert "named a place in the picture as grey" in flat(methods_text(records(solve=SOLVE | {"albedo_scale": grey})))
+    assert "grey" not in flat(methods_text(records()))
+
+
 def test_hair_is_told_of_where_it_stands_off():
     hairy = flat(methods_text(records(solve=SOLVE | {"hair": {"thickness_mm": 16.4}})))
     assert "16 mm (median) off the head" in hairy and "Visual Hull" in hairy
