@@ -26,9 +26,9 @@ OUTLYING, ALIKE = 3.0, 0.05
 which frames may differ in any case: noise and compression."""
 LARGEST_SIGMA = 0.15
 """Standard deviation over the frames from which on the place says no more than that light is usually white."""
-LARGEST_TINT = 0.7
-"""Logarithm of a ratio of channels that no light of a room or of a day gives grey after a white balance; tungsten light
-by a camera set to daylight reaches it."""
+LARGEST_TINT = 1.5
+"""Logarithm of a ratio of channels that no light of a room or of a day gives grey: tungsten light by a camera set to
+daylight has 0.8 in red and -1.3 in blue."""
 
 
 class GreyLook(NamedTuple):

@@ -68,7 +68,7 @@ def test_clipped_and_black_frames_do_not_count():
 @pytest.mark.parametrize("colours, words", [
     ([5 * TINT] * 10 + [TINT] * 2, "2 of 12 frames can be read there, the others are overexposed"),
     ([5 * TINT] * 6 + [0.01 * TINT] * 6, "0 of 12 frames can be read there, the others are overexposed and too dark"),
-    ([SKIN[[1, 0, 2]] * [0.3, 1.0, 0.7]] * 12, "no usual light makes of grey"),
+    ([SKIN[[1, 0, 2]] * [0.1, 1.0, 0.7]] * 12, "no usual light makes of grey"),
     ([[0.5, 0.1, 0.5], [0.5, 0.25, 0.1], [0.2, 0.5, 0.35]], "not the same in 3 frames"),
     ([TINT, SKIN] * 6, "not the same in 12 frames"),
 ])

@@ -93,8 +93,8 @@ def test_what_light_a_wall_of_hair_keeps_off_is_known():
     index = np.nonzero(mesh.vertices[:, 1] > -70.0)[0]
     points = mesh_points(mesh, index)
     direct = np.maximum(points.normals @ directions.T, 0.0) * 4.0 / len(directions)
-    shading = SimpleNamespace(index=index, points=points, directions=directions, transfer=SimpleNamespace(direct=direct),
-                              light_along=np.ones((len(directions), 3, 3)))
+    shading = SimpleNamespace(index=index, points=points, directions=directions,
+                              transfer=SimpleNamespace(direct=direct), light_along=np.ones((len(directions), 3, 3)))
     wall = 100.0 * np.array([[1, -500, -500], [1, 500, -500], [1, 500, 500], [1, -500, 500]])
     scene = RayScene(np.concatenate([mesh.vertices, wall]),
                      np.concatenate([mesh.faces, len(mesh.vertices) + np.array([[0, 1, 2], [0, 2, 3]])]))
