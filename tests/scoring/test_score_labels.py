@@ -5,7 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from shared.geometry.mesh import vertex_normals
+from shared.geometry.parts import mesh_part
+from shared.hair.hair_files import write_hair
+from shared.hair.joined import HairSurface
 from shared.imaging.material_labels import CLOTH, HAIR, LABELS, LIPS, SKIN, UNKNOWN
+from shared.imaging.texture import sample_bilinear
 from shared.io.arrays import load_arrays
 from shared.io.images import read_png
 from shared.io.material_maps import write_material
@@ -31,7 +36,7 @@ def subject(tmp_path_factory):
 
 def scores_of(subject, folder, probabilities):
     """The scores of a result whose mesh and poses are the truth's."""
-    (folder / "maps").mkdir(parents=True)
+    (folder / "maps").mkdir(parents=True, exist_ok=True)
     write_material(folder / "maps" / "material.exr", probabilities.astype(np.float32), half=True, attributes={})
     truth = load_arrays(subject / "gt" / "poses.npz")
     poses = dict(enumerate(truth["camera_from_head"]))
@@ -72,3 +77,21 @@ def test_the_table_has_lines_for_labels():
     assert "labels" not in table(base)
     text = table(base | {"labels": labels})
     assert "skin 0.900" in text and "skin 0.800" in text and "10.0% of the texels unknown" in text
+
+
+def test_hair_with_a_surface_of_its_own_is_hair(subject, tmp_path):
+    """A head whose map takes all hair for skin, and over it the hair's own surface, 1 mm further out: by pixels hair is
+    hair again, and the head's texels beneath are hidden. Where its alpha is low it is not there."""
+    label, mesh = read_png(subject / "gt" / "label.png"), read_obj(subject / "gt" / "mesh.obj")
+    bare = np.eye(len(LABELS))[np.where(label == HAIR, SKIN, label)]
+    hairy = sample_bilinear((label == HAIR).astype(float), mesh.uvs[mesh.face_uvs].mean(1)).ravel() > 0.5
+    outer = mesh.replace(vertices=mesh.vertices + vertex_normals(mesh.vertices, mesh.faces))
+    hair, scores = mesh_part(outer, hairy)[0], {"bare": scores_of(subject, tmp_path / "bare", bare)}
+    for name, alpha in (("there", 1.0), ("thin", 0.2)):
+        (tmp_path / name / "maps").mkdir(parents=True)
+        write_hair(tmp_path / name, HairSurface(hair, np.full((32, 32, 3), 0.1, np.float32),
+                                                np.full((32, 32), alpha, np.float32)))
+        scores[name] = scores_of(subject, tmp_path / name, bare)
+    assert scores["bare"]["pixels"].get("hair", 0.0) == 0.0 == scores["thin"]["pixels"].get("hair", 0.0)
+    assert scores["there"]["pixels"]["hair"] > 0.85 and scores["there"]["pixels"]["skin"] > 0.85
+    assert scores["there"]["texels"]["skin"] > scores["bare"]["texels"]["skin"] + 0.1
