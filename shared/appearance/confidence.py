@@ -5,8 +5,9 @@
 p: PRIOR_SPREAD, the log albedo's spread if all one knew were the person's mean. v: its variance by what the frames say,
 1 / information, which counts light, normals, shadows, borders and contradictions generously: errors of skin are two or
 three times smaller. d: standard deviation by what the frames cannot say, however well they agree, since the model has
-no such thing: detail finer than the pictures, and highlights of hair. By itself it makes the confidence 0.5 where an
-error of p, dE2000 of 6 to 8 by the colour, lies SURE deviations away: few texels above 0.5 are off by more.
+no such thing: detail finer than the pictures, highlights of hair, shadows of hair on the head. By itself it makes the
+confidence 0.5 where an error of p, dE2000 of 6 to 8 by the colour, lies SURE deviations away: few texels above 0.5 are
+off by more.
 """
 
 from __future__ import annotations
