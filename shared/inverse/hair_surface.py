@@ -50,8 +50,8 @@ GAP_MM = 1.0
 """Between hair and what it presses flat."""
 SHADOW_DIRECTIONS, SHADOW_BLOCK = 192, 4096
 """That the light which hair keeps off the head is summed along, and vertices at a time."""
-SHADOW_SPREAD = 3.0**-0.5
-"""Root mean square of what hair keeps off, over what its hull does: hulls are larger, so it is anything from none of
+SHADOW_SPREAD = 12.0**-0.5
+"""Standard deviation of what hair keeps off, over what its hull does: hulls are larger, so it is anything from none of
 that to all."""
 
 
