@@ -22,7 +22,7 @@ from shared.contract.records import LANDMARKS, MESH, TRACKED_POSES, TRACKING, TR
 
 STAGE = Stage(
     name="track_landmarks",
-    version=21,
+    version=22,
     help="Head pose in each frame and the head's shape, from landmarks and dense skin tracks.",
     inputs=("sample_frames",),
     given=("landmarks", "poses"),

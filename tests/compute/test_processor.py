@@ -1,5 +1,8 @@
 """What keeps a rounding from becoming a result: choices with a margin, sums in doubles, OpenCV's plain code."""
 
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -26,6 +29,17 @@ def test_opencv_leaves_the_processors_own_code(optimised):
     assert cv2.useOptimized()
     use_baseline_opencv()
     assert not cv2.useOptimized()
+
+
+def test_other_threads_leave_ipp_too():
+    """OpenCV switches IPP thread by thread, and stages compute in several; of that nothing is said on the terminal."""
+    code = ("import threading, cv2\n"
+            "from shared.compute.processor import use_baseline_opencv\n"
+            "use_baseline_opencv()\n"
+            "thread = threading.Thread(target=lambda: print(cv2.ipp.useIPP()))\n"
+            "thread.start()\nthread.join()\nprint(cv2.ipp.useIPP())\n")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (done.stdout.split(), done.stderr) == (["False", "False"], "")
 
 
 def test_vertices_are_spread_alike_after_a_rounding():

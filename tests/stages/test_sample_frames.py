@@ -199,9 +199,11 @@ def test_a_person_says_where_the_chart_is_or_that_there_is_none(tmp_path, subjec
 
 
 def test_a_person_names_a_grey_place(tmp_path, subject, capsys):
-    """The drawn wall is bluish at the left, and a sign is held before it in some frames."""
+    """The drawn wall is bluish at the left, with a sign held before it in one frame; a red sign hangs at the right."""
     frames = turning_face(8)
     frames[3][80:100, 2:20] = (190, 60, 40)
+    for frame in frames:
+        frame[20:44, 204:230] = (220, 40, 40)
     video = write_video(tmp_path / "clip.mp4", frames, pixel_format="yuv444p")
     code, out = subject(video)
     assert code == 0 and "grey" not in frames_json(out) and FrameSet.open(out).grey is None
@@ -213,9 +215,9 @@ def test_a_person_names_a_grey_place(tmp_path, subject, capsys):
     assert FrameSet.open(out).grey == said and content == json.loads(plain)
     assert said["frames"] == [frame["frame_index"] for frame in content["frames"] if frame["frame_index"] != 3]
     np.testing.assert_allclose(said["colour"], decode_srgb(np.array([61, 71, 81]) / 255), rtol=0.06)
-    code, out = subject(video, yaml="grey: [120, 95]\n")
+    code, out = subject(video, yaml="grey: [217, 32]\n")
     assert code == 0 and "grey" not in frames_json(out)
-    assert any("the grey place at (120, 95) is not used" in text for text in frames_json(out)["warnings"])
+    assert any("the grey place at (217, 32) is not used" in text for text in frames_json(out)["warnings"])
     capsys.readouterr()
     assert subject(video, yaml="grey: [8, 201]\n")[0] == 2
     error = capsys.readouterr().err
