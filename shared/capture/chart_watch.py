@@ -21,6 +21,7 @@ from shared.capture.chart_finder import (
 from shared.capture.crop_pixels import decode_table, display_codes
 from shared.contract.chart_place import ChartPlace
 from shared.imaging.color import encode_srgb
+from shared.imaging.frame_index import spread_frames
 
 LOOKS = 12
 """Frames to look at, evenly spread."""
@@ -48,7 +49,7 @@ class ChartWatch:
     def expect(self, count: int) -> None:
         """Chooses the positions to look at among `count` frames; none where a person says where the chart is."""
         if self._place.look and self._place.frame is None:
-            self._wanted = set(np.linspace(0, count - 1, min(LOOKS, count)).round().astype(int).tolist())
+            self._wanted = set(spread_frames(count, LOOKS).tolist())
 
     def look(self, position: int, frame_index: int, codes: np.ndarray) -> None:
         """A frame in full, code values [H, W, 3]; passed over unless its position is wanted."""

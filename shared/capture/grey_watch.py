@@ -14,6 +14,7 @@ import numpy as np
 from shared.capture.chart_finder import clipping_limit
 from shared.capture.crop_pixels import decode_table
 from shared.compute.robust import ROBUST_SCALE
+from shared.imaging.frame_index import spread_frames
 
 LOOKS, FEWEST_FRAMES = 12, 3
 """Frames to look at, evenly spread, and how many of them have to agree."""
@@ -52,7 +53,7 @@ class GreyWatch:
     def expect(self, count: int) -> None:
         """Chooses the positions to look at among `count` frames; none where no place is named."""
         if self._place is not None:
-            self._wanted = set(np.linspace(0, count - 1, min(LOOKS, count)).round().astype(int).tolist())
+            self._wanted = set(spread_frames(count, LOOKS).tolist())
 
     def look(self, position: int, frame_index: int, codes: np.ndarray) -> None:
         """A frame in full, code values [H, W, 3]; passed over unless its position is wanted."""

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-from shared.contract.wording import check_keys
+from shared.contract.wording import check_keys, check_pixels
 from shared.errors import InputError, shown
 
 _EXPECTED = "auto | off | {frame: 12, corners: [[x, y], [x, y], [x, y], [x, y]]}"
@@ -45,9 +44,7 @@ def _corners(given: object, where: str) -> tuple[tuple[float, float], ...]:
     points = given if isinstance(given, list) else []
     if len(points) != 4 or not all(isinstance(point, list) and len(point) == 2 for point in points):
         raise InputError("not four corners", where=where, got=shown(given), expected=_EXPECTED)
-    for value in (value for point in points for value in point):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise InputError("not a number of pixels", where=where, got=shown(value), expected=_CORNERS)
+    check_pixels([value for point in points for value in point], where, _CORNERS)
     corners = tuple((float(x), float(y)) for x, y in points)
     if not _around(corners):
         raise InputError("the corners do not go around the chart", where=where, got=shown(given), expected=_CORNERS)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-
+from shared.contract.wording import check_pixels
 from shared.errors import InputError, shown
 
 _EXPECTED = "[x, y] in pixels of the source frame"
@@ -18,9 +17,7 @@ def parse_grey(given: object, moves: str, where: str) -> tuple[float, float] | N
         return None
     if not isinstance(given, list) or len(given) != 2:
         raise InputError("not a place in the picture", where=where, got=shown(given), expected=_EXPECTED)
-    for value in given:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise InputError("not a number of pixels", where=where, got=shown(value), expected=_EXPECTED)
+    check_pixels(given, where, _EXPECTED)
     if moves == "camera":
         raise InputError("a grey place before a camera that moves", where=where, got=shown(given),
                          hint="leave grey out: only a camera that stands still shows one thing in one place")

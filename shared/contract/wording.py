@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import stat
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -82,6 +83,13 @@ class _StrictLoader(yaml.SafeLoader):
 
 for _kind in ("int", "float"):
     _StrictLoader.add_constructor(f"tag:yaml.org,2002:{_kind}", getattr(_StrictLoader, f"construct_yaml_{_kind}"))
+
+
+def check_pixels(values: Iterable[object], where: str, expected: str) -> None:
+    """InputError unless all are finite numbers."""
+    for value in values:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise InputError("not a number of pixels", where=where, got=shown(value), expected=expected)
 
 
 def read_yaml(path: Path) -> object:
