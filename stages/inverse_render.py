@@ -13,8 +13,9 @@ Method   What no track reaches (ears, skull, jaw) moves until the mesh's outline
          new ones. Light is summed along directions that lie close where a small lamp passes. Where there is one, it
          stands at the distance that held-out frames ask for, far away if they ask for none
          (shared/inverse/lamp_distance.py). Exposure that drifts is a gain of each frame (shared/inverse/exposure.py).
-         Or (model=auto) how many numbers describe the light, and whether there are highlights, is chosen first, on few
-         points and frames: shared/selection/candidates.py. Then the tracked mesh, not one that is given, gets a smooth
+         How many numbers describe the light, and whether there are highlights, is chosen first, on few points
+         (shared/selection/candidates.py), and how much of the clip tells that light (shared/selection/samples.py);
+         with model=full all of it is solved. The tracked mesh, not one that is given, gets a smooth
          rim at the neck (shared/geometry/rim.py). Then albedo and specular intensity per texel in closed form,
          streaming over the frames; samples where a cast shadow ends, which the mesh tells to millimetres only, count
          less. The solver starts from a uniform light and the priors: of one clip it needs no start from init_albedo,
@@ -37,7 +38,7 @@ from shared.contract.records import MESH, SELECTION_TIMES, SOLVE, SOLVED_POSES, 
 from shared.errors import InputError, LimnError
 
 SOLVERS = ("transfer", "reference")
-MODELS = ("full", "auto")
+MODELS = ("auto", "full")
 SELECTION_SECONDS = "model_selection_seconds.json"
 LIGHT_MODELS = ("cubemap", "harmonics_2", "harmonics_4", "sun_sky", "camera")
 
@@ -70,7 +71,7 @@ PUBLISHED = ParameterGroup(
 
 STAGE = Stage(
     name="inverse_render",
-    version=42,
+    version=43,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -97,23 +98,26 @@ STAGE = Stage(
                volatile=True, optional=True, fields=SELECTION_TIMES),
     ),
     parameters=(
-        Parameter("map_size", int, 1024, "Edge of the maps; a power of two.", "texels",
+        Parameter("map_size", int, 1024, "Edge of the maps, at most; a power of two.", "texels",
                   choices=(64, 128, 256, 512, 1024, 2048, 4096, 8192)),
         Parameter("light_resolution", int, 16, "Edge of the light's cubemap faces.", "texels", choices=(4, 8, 16, 32)),
         Parameter("light_model", str, "cubemap", "What is unknown of the light: every texel of a cubemap, spherical "
                   "harmonics of its logarithm, one sun and a sky, or a lamp at the camera.", choices=LIGHT_MODELS),
-        Parameter("model", str, "full", "Solve the full model that the other parameters describe, or climb towards it "
-                  "only as far as held-out frames, and what is known of skin, ask for it.", choices=MODELS),
+        Parameter("model", str, "auto", "Climb towards the model that the other parameters describe only as far as "
+                  "held-out frames, and what is known of skin, ask for it, with no more samples than tell its light "
+                  "and no finer maps than the pixels fill; or solve all of it. With solver=transfer.", choices=MODELS),
         Parameter("fixed_parts", str, "", "Parts of the model that model=auto leaves as the other parameters say, "
-                  "separated by commas: light, specular.", former="forced"),
+                  "separated by commas: light, specular, samples (light_frames, points, directions, bounce_nodes), "
+                  "maps (map_size).", former="forced"),
         Parameter("lamp_distance", str, "auto", "How far the light's main lamp stands from the head: auto, as near as "
                   "the frames ask for, far, or so many mm."),
-        Parameter("points", int, 4000, "Surface points that the light is solved from.", "", 200, 40000),
+        Parameter("points", int, 4000, "Surface points that the light is solved from, at most.", "", 200, 40000),
         Parameter("coarse_points", int, 1000, "As many of them on which the light comes to rest, before a last step on "
                   "all; 0: all from the first step on.", "", 0, 40000),
-        Parameter("directions", int, 768, "Directions over the sphere.", "", 128, 8192),
-        Parameter("bounce_nodes", int, 1000, "Surface nodes that exchange bounced light.", "", 50, 6000),
-        Parameter("light_frames", int, 48, "Frames that the light is solved from, spread evenly.", "frames", 3, 1000),
+        Parameter("directions", int, 768, "Directions over the sphere, at most.", "", 128, 8192),
+        Parameter("bounce_nodes", int, 1000, "Surface nodes that exchange bounced light, at most.", "", 50, 6000),
+        Parameter("light_frames", int, 48, "Frames that the light is solved from, at most, spread evenly.", "frames",
+                  3, 1000),
         Parameter("light_steps", int, 20, "Largest number of steps per resolution of the light.", "", 1, 100),
         Parameter("hold_out_every", int, 8, "One frame in so many is held out to judge the fit.", "frames", 3, 1000),
         Parameter("visibility", bool, True, "Let parts of the head cover each other; off, nothing bounces either."),

@@ -228,6 +228,12 @@ _MODEL = (
     Field("model.roughness_variation.held_out", "Error on the held-out frames.", "", optional=True),
     Field("model.roughness_variation.held_out.one", "With one value."),
     Field("model.roughness_variation.held_out.local", "With local roughness."),
+    Field("model.solved_from", "What the light was solved from; absent with solver=reference.", "", optional=True),
+    Field("model.solved_from.frames", "Frames, those held out among them.", "int"),
+    Field("model.solved_from.points", "Surface points.", "int"),
+    Field("model.solved_from.directions", "Directions that light was summed along.", "int"),
+    Field("model.solved_from.bounce_nodes", "Surface nodes that exchanged bounced light.", "int"),
+    Field("model.map_size", "Edge of the maps.", "int", unit="texels"),
 )
 _HAIR = (
     Field("hair", "Hair that stands off the head and has a surface of its own; absent where the head's own surface "

@@ -27,3 +27,13 @@ def hold_out(count: int, every: int, light_index: np.ndarray | None = None) -> n
         if len(own) > every:
             fitted[own[every // 2 :: every]] = False
     return fitted
+
+
+def halves(fitted: np.ndarray, light_index: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Two masks [F] bool that share out the frames fitted [F] bool by turns; of several lights, those of each."""
+    found = np.zeros((2, len(fitted)), bool)
+    for own in frames_of_lights(light_index, len(fitted)):
+        rows = own[fitted[own]]
+        for k, half in enumerate(found):
+            half[rows[k::2]] = True
+    return found[0], found[1]

@@ -32,9 +32,6 @@ def read_settings(
 ) -> InverseSettings:
     """All settings; checkpoint: the reference solver's own file, or None; tints: what grey places say of each light.
     InputError for what cannot go together."""
-    if params.model == "auto" and params.solver == "reference":
-        raise InputError("model=auto belongs to solver=transfer", where="--set inverse_render.model",
-                         hint="leave out one of the two; the reference solver takes visibility and specular as given")
     appearance = AppearanceSettings(
         light_model=params.light_model,
         resolutions=tuple(n for n in (8, 16, 32) if n <= params.light_resolution) or (params.light_resolution,),

@@ -59,13 +59,13 @@ def solve_clip(
     chart, chart_warning = said_by_chart(observations, viewer, views, settings)
 
     # Light on the mesh as it was tracked, of the model that is chosen there where one is to be.
-    light_views = some_views(views, settings, settings.light_frames)
-    lit = LitSurface.of(surface, light_views, settings, chart, context)
-    selected = select(lit, settings, context) if settings.selection is not None else None
+    selected = None if settings.selection is None else select(surface, views, settings, chart, context)
     if selected is None:
+        lit = LitSurface.of(surface, some_views(views, settings, settings.light_frames), settings, chart, context)
         solution = fit_appearance(lit.coarse, settings.appearance, report_to(context))
     else:
-        settings, solution = selected.settings, selected.solution
+        settings, lit, solution = selected.settings, selected.lit, selected.solution
+    light_views = some_views(views, settings, settings.light_frames)
 
     # A lamp that stands near, where held-out frames ask for one.
     by_lamp = find_lamp(lit, solution, light_views, settings, chart, context)
@@ -97,12 +97,15 @@ def solve_clip(
     surface, precomputed = lit.surface, lit.precomputed
     viewer = lit.viewer.within_rim(surface_error(surface.tracks))
     covariance, pose_record = shaped.covariance, shaped.pose_record
+    solved_from = {"frames": len(lit.capture.fitted), "points": len(lit.capture.points),
+                   "directions": len(precomputed.directions), "bounce_nodes": len(precomputed.nodes.points)}
     lit = shaped = None  # texels need the memory that the points' samples and transfer take
     stands_off = outline.get("met", 1.0) < LEAST_MET
     texels, told = solve_texels(views, surface, viewer, precomputed, settings, solution, stands_off, context)
     typical = np.median(solution.state.albedo, axis=0)
     record = {
         **told,
+        "solved_from": solved_from,
         "shape": {**shape_record, "outline": outline},
         "poses": pose_record,
         "exposure": {} if exposure is None else exposure.record,
@@ -171,6 +174,8 @@ def summarise(result: InverseResult, moves: str) -> dict:
             "roughness": round(state.roughness, 4),
             "roughness_variation": solution.roughness_record,
             "moves": moves,
+            **({"solved_from": found} if (found := result.record.get("solved_from")) else {}),
+            "map_size": len(result.texels.maps["confidence"]),
         },
         "residuals": {
             "fitted": solution.fitted,
@@ -194,14 +199,17 @@ def summarise(result: InverseResult, moves: str) -> dict:
 def in_words(record: Mapping) -> str:
     """The solved model of a solve.json in one line for people."""
     model, lamp = record["model"], record.get("lamp", {})
+    used = model.get("solved_from")
     roughness = "local" if model["roughness_variation"].get("chosen") == "local" else "one"
     parts = (
         f"light of {model['light'].rpartition(' from ')[2]}",
+        "" if used is None else f"from {used['points']} points in {used['frames']} frames",
         f"{roughness} roughness" if model["specular_intensity"] else "no highlights",
         f"lamp {lamp['distance_mm'] / 1000:.2f} m away" if "distance_mm" in lamp else "",
         "shape refined" if record.get("shape", {}).get("refined") else "shape as tracked",
         "poses solved anew on it" if record.get("poses", {}).get("kept") else "",
         "exposure of each frame" if record.get("exposure") else "",
+        f"maps of {model['map_size']} texels",
     )
     return ", ".join(filter(None, parts))
 

@@ -22,6 +22,11 @@ class Sizes:
     directions: int = 768
     nodes: int = 1000
 
+    def at_most(self, other: Sizes) -> Sizes:
+        """The smaller of each."""
+        return Sizes(min(self.points, other.points), min(self.directions, other.directions),
+                     min(self.nodes, other.nodes))
+
 
 @dataclass(frozen=True)
 class PrecomputedTransfer:

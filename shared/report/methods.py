@@ -187,10 +187,12 @@ def _transfer(parameters: Mapping[str, object]) -> Iterable[str]:
     if parameters.get("model") == "auto":
         yield ("The model of light and highlights was chosen step by step, where the error on held-out frames, joined "
                "with what the prior on skin says against the albedo, fell; what its standard error left open "
-               "{Breiman1984} was solved in the fuller model.")
-    elif light:
-        yield (f"The light was modelled as {light}, and solved by Gauss-Newton steps with the albedo eliminated "
-               "{Golub1973} {Kaufman1975}.")
+               "{Breiman1984} was solved in the fuller model. It was solved from as many frames and points as lights "
+               "of half of them {Efron1982} showed to be enough.")
+    if light:
+        chosen = parameters.get("model") == "auto" and parameters.get("light_model") == "cubemap"
+        yield (f"The light was {'' if chosen else f'modelled as {light}, and '}solved by Gauss-Newton steps with the "
+               "albedo eliminated {Golub1973} {Kaufman1975}.")
     if parameters.get("specular"):
         yield "Albedo and specular intensity were then solved in closed form for each texel."
     elif parameters.get("specular") is False:

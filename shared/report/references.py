@@ -49,6 +49,7 @@ REFERENCES = {
     "Duff2017":
         "Duff et al., Building an Orthonormal Basis, Revisited. Journal of Computer Graphics Techniques 6, 2017.",
     "Dupuy2023": "Dupuy, Benyoub, Sampling Visible GGX Normals with Spherical Caps. Computer Graphics Forum 42, 2023.",
+    "Efron1982": "Efron, The Jackknife, the Bootstrap and Other Resampling Plans. SIAM, 1982.",
     "Fry1962": "Fry, Hill, The Center of Rotation of the Eye. American Journal of Optometry 39, 1962.",
     "Garland1998": "Garland, Heckbert, Simplifying Surfaces with Color and Texture using Quadric Error Metrics. IEEE "
                    "Visualization 1998.",

@@ -1,5 +1,5 @@
-"""Which model a scene needs: candidates of rising cost, kept where held-out frames fit better.
+"""No more model than a scene needs: candidates of rising cost, and the samples that tell its light.
 
-Read in this order: candidates.
-May import: appearance.
+Read in this order: candidates, samples.
+May import: imaging, rendering, appearance.
 """

@@ -48,8 +48,8 @@ SPECULARS = ("none", "one_value")
 WORTHWHILE = {"light": 0.005, "specular": 0.0}
 """Share by which a candidate must lower the error: one of the light has more unknowns, and the solver leaves as much
 when it stops. Highlights are there on any skin, and what is unknown of them their priors nearly say."""
-PARTS = ("light", "specular")
-"""What can be fixed."""
+PARTS = ("light", "specular", "samples", "maps")
+"""What can be fixed: these candidates, how much of the clip the light is solved from, and how fine the maps are."""
 FEWEST_HELD_OUT = 3
 """Frames, below which differences between them have no standard error."""
 SELECTION_STEPS, MOVES = 5, 2
@@ -129,10 +129,11 @@ class Decision(Enum):
 
 
 def judge(before: np.ndarray, after: np.ndarray, worthwhile: float) -> Decision:
-    """Whether errors, before [H] and after [H], fell by more than the share worthwhile of them, for certain."""
+    """Whether errors, before [H] and after [H], fell by more than the share worthwhile of them, for certain. One
+    that does not let them fall is not taken where they cannot tell."""
     fall, standard_error = gain(before, after)
     beyond = fall - worthwhile * float(before.mean())
-    if abs(beyond) <= standard_error:
+    if fall > 0.0 and abs(beyond) <= standard_error:
         return Decision.OPEN
     return Decision.SERVES if beyond > 0.0 else Decision.DOES_NOT
 

@@ -45,10 +45,12 @@ def test_highlights_that_are_not_this_person_s_are_said(fit, said):
 
 def test_the_solved_model_is_one_line_for_people():
     model = {"light": "cubemap of 6 x 16^2 texels from 25 numbers per channel", "specular_intensity": 0.7,
-             "roughness_variation": {"chosen": "one"}}
+             "roughness_variation": {"chosen": "one"}, "map_size": 512}
     soft = {"model": model, "shape": {"refined": True}, "poses": {"kept": False}}
-    assert in_words(soft) == "light of 25 numbers per channel, one roughness, shape refined"
+    assert in_words(soft) == "light of 25 numbers per channel, one roughness, shape refined, maps of 512 texels"
+    few = soft | {"model": model | {"solved_from": {"frames": 24, "points": 1500}}}
+    assert in_words(few).startswith("light of 25 numbers per channel, from 1500 points in 24 frames, one roughness")
     near = soft | {"lamp": {"distance_mm": 750.0}, "poses": {"kept": True}, "exposure": {"brightness": 0.1}}
-    assert in_words(near).endswith("lamp 0.75 m away, shape refined, poses solved anew on it, exposure of each frame")
+    assert ", lamp 0.75 m away, shape refined, poses solved anew on it, exposure of each frame, " in in_words(near)
     matt = {"model": model | {"specular_intensity": 0.0, "roughness_variation": {}}}
-    assert in_words(matt) == "light of 25 numbers per channel, no highlights, shape as tracked"
+    assert in_words(matt) == "light of 25 numbers per channel, no highlights, shape as tracked, maps of 512 texels"

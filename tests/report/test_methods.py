@@ -46,7 +46,7 @@ def test_figures_and_versions_are_those_of_the_run():
     assert "SciPy" not in text and "colour chart" not in text and "another tracker" not in text
 
 
-SETTINGS = ({"light_model": "harmonics_2"}, {"light_model": "sun_sky"}, {"light_model": "camera"}, {"model": "auto"},
+SETTINGS = ({"light_model": "harmonics_2"}, {"light_model": "sun_sky"}, {"light_model": "camera"}, {"model": "full"},
             {"solver": "reference"}, {"visibility": False, "bounce": False, "specular": False}, {"bounce": False}, {})
 
 

@@ -125,7 +125,8 @@ def test_what_the_standard_error_leaves_open_takes_the_fuller_model():
     after = frames - 0.001
     after[0] += 0.012  # one frame loses what the others gain, and more
     assert abs(gain(frames, after)[0]) < gain(frames, after)[1]
-    assert judge(frames, after, 0.005) is judge(after, frames, 0.005) is Decision.OPEN
+    assert judge(after, frames, 0.005) is Decision.OPEN
+    assert judge(frames, after, 0.005) is Decision.DOES_NOT  # as uncertain, but if anything worse
     assert Decision.OPEN.accepted and not Decision.DOES_NOT.accepted
     assert judge(frames, frames - 0.00002, 0.005) is Decision.DOES_NOT  # all frames gain, but next to nothing
 
@@ -167,47 +168,65 @@ def test_a_model_becomes_the_solvers_settings():
     assert (coarse.light_model, coarse.resolutions) == ("cubemap", (4,))
 
 
-def select_on(capture, note=lambda text: None):
-    """The model that is chosen on a capture, and the settings that it is chosen from."""
-    appearance = AppearanceSettings(resolutions=(8,), specular=False, noise=(0.003, 0.01))
-    whole = InverseSettings(appearance=appearance, selection=frozenset(), shape=ShapeSettings(subdivisions=1))
-    lit = LitSurface(None, None, None, capture, capture.some_points(appearance.coarse_points))
-    return select(lit, whole, RunContext(note=note)), whole
+@pytest.fixture
+def select_on(monkeypatch):
+    """select_on(capture, note, **settings): what is chosen on a capture, and the settings that it is chosen from."""
+
+    def selected_on(capture, note=lambda text: None, **changes):
+        def lit_of(surface, views, settings, chart, context):
+            few = capture.some_points(settings.sizes.points)
+            return LitSurface(None, None, None, few, few.some_points(settings.appearance.coarse_points))
+
+        monkeypatch.setattr(model_selection.LitSurface, "of", lit_of)
+        monkeypatch.setattr(model_selection, "some_views", lambda views, settings, wanted: views)
+        monkeypatch.setattr(model_selection, "fitting_map_size", lambda surface, views, most: most // 2)
+        appearance = AppearanceSettings(resolutions=(8,), specular=False, noise=(0.003, 0.01))
+        whole = InverseSettings(appearance=appearance, selection=frozenset(), shape=ShapeSettings(subdivisions=1))
+        whole = replace(whole, **changes)
+        return select(None, None, whole, None, RunContext(note=note)), whole
+
+    return selected_on
 
 
-def test_only_the_appearance_is_chosen(one_thread):
-    """Mesh and poses are left to the same steps as under the full model."""
+def test_mesh_and_poses_are_left_to_the_same_steps_as_under_the_full_model(one_thread, select_on):
     notes = []
     chosen, whole = select_on(make_truth(specular=0.0, lights=(even_light,))[0], notes.append)
-    assert chosen.settings == replace(whole, appearance=chosen.settings.appearance)
+    kept = {name: getattr(whole, name) for name in ("appearance", "light_frames", "sizes", "map_size")}
+    assert replace(chosen.settings, **kept) == whole
     assert chosen.settings.appearance.light_model == "harmonics_2" and 0.0 < chosen.solution.held_out < 1.5 * NOISE
-    assert "not accepted" in notes[len(chosen.candidates) - 1]
+    assert chosen.settings.light_frames < whole.light_frames and chosen.settings.map_size == whole.map_size // 2
+    assert chosen.settings.sizes.directions < whole.sizes.directions
+    assert "not accepted" in notes[len(chosen.candidates) - 1] and "Samples(" in notes[len(chosen.candidates)]
 
 
-def test_a_decision_that_stays_open_says_so(one_thread, monkeypatch):
+def test_parts_that_are_fixed_stay_as_the_settings_say(one_thread, select_on):
+    fixed = frozenset({"light", "samples", "maps"})
+    chosen, whole = select_on(make_truth(specular=0.0, lights=(even_light,))[0], selection=fixed)
+    assert chosen.settings == whole and len(chosen.candidates) == 1
+
+
+def test_a_decision_that_stays_open_says_so(one_thread, monkeypatch, select_on):
     notes, frames = [], np.full(9, 0.02)
-    uneven = np.where(np.arange(9) % 2, 0.021, 0.019)
+    uneven = np.where(np.arange(9) % 2, 0.0205, 0.019)
     monkeypatch.setattr(ModelSelection, "_try", lambda self, model, start: Trial(
         model, start, frames if model.light == "harmonics_2" else uneven, 0.1))
     monkeypatch.setattr(model_selection, "fit_all_points", lambda *_: None)
-    chosen, _ = select_on(make_truth(specular=0.0)[0], notes.append)
+    chosen, _ = select_on(make_truth(specular=0.0)[0], notes.append, selection=frozenset({"samples"}))
     assert chosen.candidates[1]["open"] and chosen.candidates[1]["accepted"]
     assert "accepted, since held-out frames leave it open" in notes[1]
 
 
-def test_too_few_held_out_frames_choose_no_model():
+def test_too_few_held_out_frames_choose_no_model(select_on):
     """Where those that are fitted are few, they are not held out to judge."""
-    capture = make_truth(specular=0.0)[0]
-    notes, few = [], InverseSettings(selection=frozenset(), fit_frames=12)
-    lit = LitSurface(None, None, None, None, replace(capture, fitted=np.arange(14) > 1))
-    assert select(lit, few, RunContext(note=notes.append)) is None
+    notes, capture = [], make_truth(specular=0.0)[0]
+    assert select_on(replace(capture, fitted=np.arange(14) > 1), notes.append, fit_frames=12)[0] is None
     assert "2 frames are too few" in notes[0]
 
 
 def test_more_frames_judge_than_are_held_out_of_the_solve():
     capture = make_truth(specular=0.0)[0]
     judged = judged_capture(capture, InverseSettings())
-    assert len(judged.points) <= 400 and not judged.fitted[~capture.fitted].any()
+    assert judged.points is capture.points and not judged.fitted[~capture.fitted].any()
     assert (~judged.fitted).sum() > (~capture.fitted).sum()
     assert (judged_capture(capture, InverseSettings(fit_frames=12)).fitted == capture.fitted).all()
 
@@ -217,17 +236,15 @@ def told(**changes):
     return Parameters({**STAGE.defaults(), **STAGE.parse(changes, "test")})
 
 
-def test_the_stage_selects_only_when_told_to():
-    assert read_settings(told()).selection is None
-    assert read_settings(told(model="auto")).selection == frozenset()
-    assert read_settings(told(model="auto", fixed_parts="light, specular")).selection == {"light", "specular"}
+def test_the_stage_selects_unless_told_not_to():
+    assert read_settings(told()).selection == frozenset()
+    assert read_settings(told(model="full")).selection is None
+    assert read_settings(told(fixed_parts="light, maps")).selection == {"light", "maps"}
 
 
 def test_forcing_what_there_is_not_is_one_clear_line():
     with pytest.raises(InputError, match="unknown part of the model 'ligth'.*did you mean light"):
         read_forced("ligth")
-    with pytest.raises(InputError, match="model=auto belongs to solver=transfer"):
-        read_settings(told(model="auto", solver="reference"))
 
 
 def test_model_selection_reaches_run_json_and_the_report(glossy, tmp_path):

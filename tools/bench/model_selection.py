@@ -31,20 +31,21 @@ from shared.rendering.specular_transfer import specular_tables
 from tools.bench.clips import SettingsBench, settings_of
 from tools.bench.runner import Clock, Entry, Table
 
-LEAST = {"visibility": False, "specular": False, "light_model": "harmonics_2"}
+FULL = {"model": "full"}
+LEAST = {**FULL, "visibility": False, "specular": False, "light_model": "harmonics_2"}
 CANDIDATES: dict[str, dict] = {
     "auto": {"model": "auto", "light_resolution": 32},
     "least": LEAST,
-    "harmonics_2": {"light_model": "harmonics_2"},
-    "harmonics_2_matte": {"light_model": "harmonics_2", "specular": False},
-    "sun_sky": {"light_model": "sun_sky"},
-    "harmonics_4": {"light_model": "harmonics_4"},
-    "cubemap_8": {"light_resolution": 8},
-    "cubemap_16": {"light_resolution": 16},
-    "cubemap_16_matte": {"light_resolution": 16, "specular": False},
-    "cubemap_16_no_bounce": {"light_resolution": 16, "bounce": False},
-    "cubemap_16_no_visibility": {"light_resolution": 16, "visibility": False},
-    "cubemap_32": {"light_resolution": 32},
+    "harmonics_2": {**FULL, "light_model": "harmonics_2"},
+    "harmonics_2_matte": {**FULL, "light_model": "harmonics_2", "specular": False},
+    "sun_sky": {**FULL, "light_model": "sun_sky"},
+    "harmonics_4": {**FULL, "light_model": "harmonics_4"},
+    "cubemap_8": {**FULL, "light_resolution": 8},
+    "cubemap_16": {**FULL, "light_resolution": 16},
+    "cubemap_16_matte": {**FULL, "light_resolution": 16, "specular": False},
+    "cubemap_16_no_bounce": {**FULL, "light_resolution": 16, "bounce": False},
+    "cubemap_16_no_visibility": {**FULL, "light_resolution": 16, "visibility": False},
+    "cubemap_32": {**FULL, "light_resolution": 32},
 }
 SMALLEST = {"map_size": 64, "normal_map": False, "local_roughness": False}
 """Model selection ends before the maps; they are as small as they can be."""

@@ -155,7 +155,7 @@ class _Scored:
 def _transfer_row(subject: Path, run: Path, tracked: bool, changes: dict) -> dict:
     """Seconds, steps and errors of one solve."""
     inputs, clock = open_clip(subject, run, tracked), Clock()
-    result = solve_clip(inputs.views, inputs.surface, settings_of(changes), RunContext(note=print))
+    result = solve_clip(inputs.views, inputs.surface, settings_of({"model": "full"} | changes), RunContext(note=print))
     found = {"seconds": clock.cpu_s, "iteration": len(result.solution.iterations)}
     return found | map_errors(subject, inputs, inputs.frame_index, result.texels.mesh, result.texels.maps)
 

@@ -112,7 +112,7 @@ class ShapeBench(ClipBench):
 
     def refined(self, smoothness: float) -> dict[str, float]:
         """A row of the table: the clip solved with that lambda, maps as small as they can be."""
-        small = {"map_size": 64, "normal_map": False}
+        small = {"model": "full", "map_size": 64, "normal_map": False}
         settings, clock = settings_of({**small, **self.given, "shape_smoothness": smoothness}), Clock()
         result = solve_clip(self.clip.views, self.clip.surface, settings)
         found = {"smoothness": smoothness, "seconds": clock.wall_s, "held_out_residual": result.solution.held_out,

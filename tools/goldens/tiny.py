@@ -12,6 +12,7 @@ STAGES = ("sample_frames", "track_landmarks", "init_albedo", "inverse_render", "
 SETTINGS: dict[str, tuple[str, ...]] = {
     "init_albedo": ("size=128",),
     "inverse_render": (
+        "model=full",  # a choice could hang on how a processor rounds, and all that follows on the choice
         "map_size=128",
         "light_resolution=8",
         "points=1000",

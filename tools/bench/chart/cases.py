@@ -16,13 +16,14 @@ GROUPS = {
 }
 SETS = ("quick", "all")
 FRAMES, IMAGE = "sample_frames.frame_count", "sample_frames.max_size"
+SAMPLES, MAPS = {"inverse_render.fixed_parts": "samples"}, {"inverse_render.fixed_parts": "maps"}
 ABLATIONS: dict[str, dict[str, object]] = {
     **{f"{n} frames": {FRAMES: n} for n in (12, 24, 48, 96, 150, 250)},
     **{f"{n} px": {IMAGE: n} for n in (256, 512, 720, 1024)},
-    **{f"{n} directions": {"inverse_render.directions": n} for n in (128, 256, 512, 768, 2048)},
-    **{f"{n} points": {"inverse_render.points": n} for n in (500, 1000, 2000, 8000)},
-    **{f"map {n}": {"inverse_render.map_size": n} for n in (256, 512, 1024, 2048)},
-    **{f"light {n}": {"inverse_render.light_resolution": n} for n in (8, 16, 32)},
+    **{f"{n} directions": {"inverse_render.directions": n, **SAMPLES} for n in (128, 256, 512, 768, 2048)},
+    **{f"{n} points": {"inverse_render.points": n, **SAMPLES} for n in (500, 1000, 2000, 8000)},
+    **{f"map {n}": {"inverse_render.map_size": n, **MAPS} for n in (256, 512, 1024, 2048)},
+    **{f"light {n}": {"inverse_render.light_resolution": n, "inverse_render.model": "full"} for n in (8, 16, 32)},
     "mesh held": {"inverse_render.shape": False},
     "mesh refined": {"inverse_render.shape": True},
     "mesh not split": {"inverse_render.shape": True, "inverse_render.shape_subdivisions": 0},
@@ -33,11 +34,11 @@ ABLATIONS: dict[str, dict[str, object]] = {
     "matte": {"inverse_render.specular": False},
     "harmonics 4": {"inverse_render.light_model": "harmonics_4"},
     "sun and sky": {"inverse_render.light_model": "sun_sky"},
-    "model auto": {"inverse_render.model": "auto"},
+    "model full": {"inverse_render.model": "full"},
 }
 """Name -> parameters; each is measured as a change of one preset."""
 QUICK = ("12 frames", "256 px", "128 directions", "2048 directions", "map 256", "mesh held", "mesh refined",
-         "no bounce", "no visibility", "matte", "model auto")  # fmt: skip
+         "no bounce", "no visibility", "matte", "model full")  # fmt: skip
 LIGHTENED = {
     "solver": "reference", "map_size": 256, "reference_pixels": 3000, "reference_light_samples": 48,
     "reference_cosine_samples": 48, "reference_lobe_samples": 16, "reference_light_resolution": 64,
