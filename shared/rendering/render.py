@@ -162,6 +162,30 @@ def seen_layers(
         face[on], bary[on], _ = viewer.scene.intersect(start + RAY_START_MM * away, away)
 
 
+def head_coverage(
+    viewer: SurfaceViewer, alpha: np.ndarray | None, camera_from_head: np.ndarray, intrinsics: np.ndarray,
+    size: tuple[int, int], samples: int = 2,
+) -> np.ndarray:
+    """[H, W] in [0, 1]: how much of each pixel of a picture of a size (width, height) the mesh covers, as render_frame
+    counts it with so many samples. alpha [S, T]: as of seen_layers."""
+    vertices = viewer.mesh.vertices @ camera_from_head[:3, :3].T + camera_from_head[:3, 3]
+    seen = vertices @ intrinsics.T
+    pixels = seen[:, :2] / seen[:, 2:]
+    low, high = (np.clip(np.floor(corner), 0, size).astype(int) for corner in (pixels.min(0), pixels.max(0) + 1.0))
+    covered = np.zeros(size[::-1])
+    width, height = high - low
+    if width <= 0 or height <= 0:
+        return covered
+    lens = intrinsics - np.array([[0.0, 0.0, low[0]], [0.0, 0.0, low[1]], [0.0, 0.0, 0.0]])
+    inside = covered[low[1] : high[1], low[0] : high[0]]
+    for row in range(samples):
+        for column in range(samples):
+            offsets = (column + 0.5) / samples, (row + 0.5) / samples
+            for _, _, share in seen_layers(viewer, alpha, camera_from_head, lens, (width, height), offsets):
+                inside += share.reshape(height, width)
+    return covered / samples**2
+
+
 def solid_viewer(mesh: Mesh, alpha: np.ndarray | None) -> SurfaceViewer:
     """A viewer of the mesh past whose faces that are less than half there, by alpha [S, T], light and looks go; None:
     all are there. Faces keep their numbers: those without area are met by no ray."""

@@ -24,7 +24,7 @@ from shared.imaging.turning_eyes import TurningEyes
 from shared.rendering.envmap import cube_from_latlong, latlong_directions, latlong_lookup
 from shared.rendering.near_lamp import NearLamp
 from shared.rendering.precomputed_transfer import Sizes, precompute_transfer
-from shared.rendering.render import LookingEyes, SurfaceMaps, render_frame, render_lights, seen_layers, solid_viewer
+from shared.rendering.render import LookingEyes, SurfaceMaps, head_coverage, render_frame, render_lights, solid_viewer
 from shared.rendering.shading import DEEP, Material, VertexShading
 from shared.rendering.split_sum import SplitSum
 from shared.rendering.studio_lights import STUDIO_LIGHTS, studio_light
@@ -38,8 +38,6 @@ ORIENTATION_MM = 40.0
 EDGE_COSINE = -0.1
 """Vertices that turn away from a camera by more than this show in no triangle that it sees."""
 RELIT_YAW_DEG = -15.0
-SAMPLES = 2
-"""Rays along each edge of a pixel that tell how much of it the head covers."""
 HELD_OUT_SHOWN = 4
 """Held-out frames that the report re-renders beside the others."""
 
@@ -287,14 +285,7 @@ class HeadViews:
 
     def coverage(self, camera: ViewCamera) -> np.ndarray:
         """[h, w] in 0 .. 1: how much of each pixel the head covers, as render counts it."""
-        covered = np.zeros(camera.size[::-1])
-        for row in range(SAMPLES):
-            for column in range(SAMPLES):
-                offsets = (column + 0.5) / SAMPLES, (row + 0.5) / SAMPLES
-                for _, _, share in seen_layers(self.viewer, self.maps.alpha, camera.camera_from_head, camera.intrinsics,
-                                               camera.size, offsets):
-                    covered += share.reshape(covered.shape)
-        return covered / SAMPLES**2
+        return head_coverage(self.viewer, self.maps.alpha, camera.camera_from_head, camera.intrinsics, camera.size)
 
     def visibility(self, camera: ViewCamera, roughness: float) -> np.ndarray:
         """[h, w]: share of a lobe of this roughness about the reflected direction that the head leaves open; NaN beside

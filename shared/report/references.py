@@ -36,6 +36,7 @@ REFERENCES = {
     "Chen1992":
         "Chen, Medioni, Object modelling by registration of multiple range images. Image and Vision Computing 10, "
         "1992.",
+    "Chuang2001": "Chuang et al., A Bayesian Approach to Digital Matting. CVPR 2001.",
     "Cipolla2000": "Cipolla, Giblin, Visual Motion of Curves and Surfaces. Cambridge University Press, 2000.",
     "Collins2014":
         "Collins, Bartoli, Infinitesimal Plane-Based Pose Estimation. International Journal of Computer Vision 109, "
@@ -60,6 +61,7 @@ REFERENCES = {
         "Golub, Pereyra, The Differentiation of Pseudo-Inverses and Nonlinear Least Squares Problems Whose Variables "
         "Separate. SIAM Journal on Numerical Analysis 10, 1973.",
     "Goral1984": "Goral et al., Modeling the Interaction of Light Between Diffuse Surfaces. SIGGRAPH 1984.",
+    "Gortler1996": "Gortler et al., The Lumigraph. SIGGRAPH 1996.",
     "Halstead1993":
         "Halstead, Kass, DeRose, Efficient, Fair Interpolation using Catmull-Clark Surfaces. SIGGRAPH 1993.",
     "Harris2020": "Harris et al., Array programming with NumPy. Nature 585, 2020.",
@@ -127,6 +129,7 @@ REFERENCES = {
     "Nishino2004": "Nishino, Nayar, Eyes for Relighting. ACM Transactions on Graphics 23, 2004.",
     "Noh2001": "Noh, Neumann, Expression Cloning. SIGGRAPH 2001.",
     "Paszke2019": "Paszke et al., PyTorch: An Imperative Style, High-Performance Deep Learning Library. NeurIPS 2019.",
+    "Porter1984": "Porter, Duff, Compositing Digital Images. SIGGRAPH 1984.",
     "Ramamoorthi2001":
         "Ramamoorthi, Hanrahan, An Efficient Representation for Irradiance Environment Maps. SIGGRAPH 2001.",
     "Rasmussen2006": "Rasmussen, Williams, Gaussian Processes for Machine Learning. MIT Press, 2006.",
