@@ -1,11 +1,11 @@
 """The result as files that other programs open, and a page on which a person judges it.
 
-Reads    sample_frames: frames.json and the frames (for the plates and the report). track_landmarks: tracking.json
-         and overlay.png. init_albedo: its record. inverse_render: maps, envmap.exr, mesh.npz, hair.npz, poses.npz,
-         renders, solve.json. Of all of them manifest.json and provenance.json. Of several clips the first is exported,
-         and the light of each.
+Reads    sample_frames: frames.json, the frames and masks (for plates, alpha and the report). track_landmarks:
+         tracking.json and overlay.png. init_albedo: its record. inverse_render: maps, envmap.exr, mesh.npz, hair.npz,
+         poses.npz, renders, solve.json. Of all of them manifest.json and provenance.json. Of several clips the first is
+         exported, and the light of each.
 Writes   head.usda with its payload, head.usdz, head.glb, mesh.obj, hair.obj, maps/*.exr, envmap.exr, envmaps/*.exr,
-         poses.npz, plates/*.jpg, renders/*.exr, views/*.exr, run.json, methods.txt, report.html.
+         poses.npz, plates/*.jpg, renders/*.exr, patches/*.exr, views/*.exr, run.json, methods.txt, report.html.
 Method   The head model's facial actions are carried over to the solved head, where the mesh is the model's, and written
          as blend shapes. Edges of the full mesh are collapsed to meshes of fewer faces; the head model's quads are laid
          under it as a subdivision surface, and what it has beyond that becomes a displacement map. Units, axes, colour
@@ -55,7 +55,10 @@ STAGE = Stage(
         Output("poses.npz", "the head's pose in each frame, the lens, and where the eyes look", "mm",
                fields=EXPORTED_POSES),
         Output("plates/*.jpg", "the clip's crops, sRGB; absent when plates is off", space="crop", optional=True),
-        Output("renders/*.exr", "re-renders in full source frames", colour_space="in each file"),
+        Output("renders/*.exr", "re-renders in full source frames, premultiplied by their alpha",
+               colour_space="in each file"),
+        Output("patches/*.exr", "what covers the old head's fringe: between the clip's frame and its re-render",
+               colour_space="in each file"),
         Output("views/*.exr", "novel and relit views, and the lights of the latter; absent when views is off",
                colour_space="in each file", optional=True),
         Output("run.json", "parameters, model, costs, residuals and warnings of all stages", volatile=True,
@@ -163,21 +166,49 @@ def find_base(job: Job, surface, writer):
     return BaseHead(displaced, TextureFile(f"./maps/{writer.file_name(DISPLACEMENT)}"))
 
 
-def write_images(job: Job, writer, maps: dict, envmap, frames, render_frames: list[int]) -> None:
-    """maps/, envmap.exr and renders/ in the chosen precision and colour space."""
-    from shared.io.export_maps import HAIR_MAPS, SOLVED_MAPS, paste_crop, write_png_copies
-    from shared.io.images import read_exr
+def write_images(job: Job, writer, maps: dict, envmap) -> None:
+    """maps/ and envmap.exr in the chosen precision and colour space."""
+    from shared.io.export_maps import HAIR_MAPS, SOLVED_MAPS, write_png_copies
 
     writer.write_maps(job.out / "maps", maps)
     writer.write_colour(job.out / "envmap.exr", envmap, "radiance, clip maximum 1", latlong=True)
     if job.params.png_copies != "none":
         solved = {name: maps[name] for name in (*SOLVED_MAPS, *HAIR_MAPS) if name in maps}
         write_png_copies(job.out / "maps" / "png", solved, int(job.params.png_copies))
-    (job.out / "renders").mkdir()
-    for frame_index in job.progress(render_frames, "renders"):
-        crop = read_exr(job.input("inverse_render") / "renders" / f"{frame_index:06d}.exr")
-        full = paste_crop(crop, frames.crop, frames.source_size)
-        writer.write_colour(job.out / "renders" / f"{frame_index:04d}.exr", full, "radiance, clip maximum 1")
+
+
+def write_renders(job: Job, writer, mesh, alpha, poses: dict, frames, solve: dict) -> tuple[dict, list[str]]:
+    """renders/ and patches/ -> {frame: [H, W, 3], a few of the crops with the re-render in the old head's place}, and
+    sentences about alpha. mesh: the head's with what stands off it, alpha [S, T] how much of it is there, None: all."""
+    import numpy as np
+
+    from shared.imaging.image_sampling import SurfaceViewer
+    from shared.io.export_maps import paste_crop
+    from shared.io.images import read_exr
+    from shared.rendering.compositing import LEAST_AGREED, head_layers
+    from shared.rendering.render import head_coverage
+    from shared.report.content import FRAMES_COMPOSED, chosen_frames
+
+    shown = chosen_frames(solve["render_frames"], solve.get("held_out_frames", ()), FRAMES_COMPOSED)
+    viewer, lens = SurfaceViewer.of(mesh), poses.get("intrinsics_crop", frames.intrinsics)
+    place = {int(frame): f for f, frame in enumerate(poses["frame_index"])}
+    composites, apart = {}, []
+    for name in ("renders", "patches"):
+        (job.out / name).mkdir()
+    for frame in job.progress(solve["render_frames"], "renders"):
+        render = read_exr(job.input("inverse_render") / "renders" / f"{frame:06d}.exr")
+        coverage = head_coverage(viewer, alpha, poses["camera_from_head"][place[frame]], lens, frames.size)
+        position = frames.position(frame)
+        layers = head_layers(frames.read_linear(position), frames.read_mask(position) > 0,
+                             np.where((render > 0.0).any(-1), coverage, 0.0))
+        apart += [frame] if layers.agreed < LEAST_AGREED else []
+        if frame in shown:
+            composites[frame] = layers.composite(render)
+        for name, layer in (("renders", layers.premultiplied(render)), ("patches", layers.patch)):
+            full = paste_crop(layer, frames.crop, frames.source_size)
+            writer.write_colour(job.out / name / f"{frame:04d}.exr", full, "radiance, clip maximum 1; premultiplied")
+    told = f"person masks miss much of the head in {len(apart)} of {len(solve['render_frames'])} re-rendered frames: "
+    return composites, [told + "the alpha of these is the mesh's alone"] if apart else []
 
 
 def describe_capture(job: Job, poses: dict, frames, actions):
@@ -329,9 +360,9 @@ def write_lights(job: Job, writer, envmap, clips: list) -> None:
             writer.write_colour(job.out / "envmaps" / f"{name}.exr", light, "radiance, clip maximum 1", latlong=True)
 
 
-def run_record(job: Job, mesh, actions: dict, solve: dict, own_seconds: float) -> dict:
+def run_record(job: Job, mesh, actions: dict, solve: dict, own_seconds: float, own_warnings: list[str]) -> dict:
     """The content of run.json: what each stage was told, what it took, what it found. actions: what find_actions says
-    of them; own_seconds: what this stage took so far."""
+    of them; own_seconds: what this stage took so far; own_warnings: of it, beside those of the mesh."""
     from shared.geometry.mesh_checks import mesh_warnings
     from shared.report.content import own_record, selection_record, stage_record, warnings_of
 
@@ -341,7 +372,7 @@ def run_record(job: Job, mesh, actions: dict, solve: dict, own_seconds: float) -
         records[name] = stage_record(job.manifest(stage, clip), job.provenance(stage, clip))
         warnings += [(name, text) for _, text in warnings_of(stage, job.input(stage, clip), records[name])]
     own = own_record(STAGE.version, job.params.as_dict(), own_seconds)
-    for text in mesh_warnings(mesh):
+    for text in (*mesh_warnings(mesh), *own_warnings):
         job.warn(text)
         own["warnings"].append(text)
         warnings.append((STAGE.name, text))
@@ -418,7 +449,11 @@ def run(job: Job) -> None:
     source = {"stage": STAGE.name, "stage_version": STAGE.version, "source": "inverse_render"}
     params = job.params
     writer = MapWriter(params.map_format == "half", params.acescg, source, params.map_layout, params.udim)
-    write_images(job, writer, maps, envmap, frames, solve["render_frames"])
+    write_images(job, writer, maps, envmap)
+    seen_mesh, seen_maps, head_faces = mesh, maps, None
+    if hair is not None:
+        seen_mesh, seen_maps, head_faces = joined_mesh(mesh, hair.mesh), joined_maps(maps, hair), len(mesh.faces)
+    composites, outline_warnings = write_renders(job, writer, seen_mesh, seen_maps.get("alpha"), poses, frames, solve)
     clips = other_clips(job, solve)
     write_lights(job, writer, envmap, clips)
     lamp, far = near_lamp(solve), envmap
@@ -435,11 +470,8 @@ def run(job: Job) -> None:
     capture = describe_capture(job, poses, frames, actions)
     asset = describe_asset(job, mesh, eyes, actions, details, base, strands, capture, frames, writer, lamp)
     write_assets(job, asset, eyeballs, poses, maps, far)
-    seen_mesh, seen_maps, head_faces = mesh, maps, None
-    if hair is not None:
-        seen_mesh, seen_maps, head_faces = joined_mesh(mesh, hair.mesh), joined_maps(maps, hair), len(mesh.faces)
     views = render_views(job, writer, seen_mesh, seen_maps, eyes, actions, envmap, poses, frames, solve, head_faces)
-    record = run_record(job, mesh, said_of_them, solve, time.perf_counter() - start)
+    record = run_record(job, mesh, said_of_them, solve, time.perf_counter() - start, outline_warnings)
     write_json(job.out / "run.json", record)
     methods = method_records(job, record, solve)
     (job.out / "methods.txt").write_text(methods_text(methods), encoding="utf-8")
@@ -447,7 +479,7 @@ def run(job: Job) -> None:
     files = [(output.path, output.help) for output in STAGE.outputs]
     result = ReportInputs(job.subject.name, folders, frames, details[PAGE_DETAIL].mesh, shading_normals(mesh), poses,
                           maps, envmap, solve, record, files, views, clips, methods_paragraphs(methods), eyes, actions,
-                          strands)
+                          strands, composites)
     page = report_html(result_content(result, job.params.report_frames))
     (job.out / "report.html").write_text(page, encoding="utf-8")
 

@@ -89,8 +89,10 @@ class MapWriter:
         return map_file(name, self.udim)
 
     def write_colour(self, path: Path, rgb: np.ndarray, unit: str, *, latlong: bool = False) -> None:
-        """[H, W, 3] scene-linear Rec.709 -> EXR in colour_space."""
-        converted = acescg_from_rec709(rgb) if self.acescg else rgb
+        """[H, W, 3] scene-linear Rec.709 -> EXR in colour_space; [H, W, 4]: premultiplied, and alpha."""
+        converted = acescg_from_rec709(rgb[..., :3]) if self.acescg else rgb[..., :3]
+        if rgb.shape[2] == 4:
+            converted = np.concatenate([converted, rgb[..., 3:]], axis=-1)
         extra = {"layout": "+y top row, +z centre, +x left of it"} if latlong else {}
         self._write(path, converted, self.colour_space, {"unit": unit, **extra}, latlong=latlong)
 
@@ -143,7 +145,7 @@ def write_png_copies(folder: Path, maps: Mapping[str, np.ndarray], bits: int) ->
 
 
 def paste_crop(crop: np.ndarray, placement: tuple[float, float, float], size: tuple[int, int]) -> np.ndarray:
-    """Resamples a crop [h, w, 3] back into the full frame: float32 [height, width, 3], 0 outside of the crop.
+    """Resamples a crop [h, w, C] back into the full frame: float32 [height, width, C], 0 outside of the crop.
 
     placement: (x0, y0, scale) with u_crop = (u_source - x0) * scale, pixel centres at integer + 0.5; size: width,
     height of the full frame. Bilinear; a crop more than twice as fine as the frame is averaged first.

@@ -20,7 +20,8 @@ _TOLERANCE = 1e-4
 def header_errors(part: ExrPart, map_name: str = "", latlong: bool = False) -> list[str]:
     """Sentences about what the header of an exported EXR gets wrong; empty when it is sound.
 
-    map_name: which of export_maps.MAPS it should be, "" for pictures; latlong: whether it is a light.
+    map_name: which of export_maps.MAPS it should be, "" for pictures, which may have an alpha; latlong: whether it is a
+    light.
     """
     errors = _channel_errors(part, map_name) + _colour_errors(part, map_name)
     content = part.values.get(CONTENT, map_name)
@@ -45,7 +46,8 @@ def _channel_errors(part: ExrPart, map_name: str) -> list[str]:
     kind = MAPS[map_name][0] if map_name in MAPS else ""
     expected = CHANNELS if kind == "materials" else "Y" if kind == "data" and map_name != "normal" else "RGB"
     errors = []
-    if names != set(expected):
+    layered = not map_name and names == set("RGBA")
+    if names != set(expected) and not layered:
         errors.append(f"channels {', '.join(sorted(names))}, expected {', '.join(expected)}")
     if any(channel.kind not in _FLOATS or channel.step != (1, 1) for channel in part.channels):
         errors.append("not all channels are floats of full size")

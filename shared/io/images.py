@@ -40,7 +40,8 @@ def write_exr(
     layout: str = "scanline",
     channels: Sequence[str] = (),
 ) -> None:
-    """Writes array [H, W] (channel Y), [H, W, 3] (RGB) or [H, W, C] with C named channels as a ZIP-compressed EXR.
+    """Writes array [H, W] (channel Y), [H, W, 3] (RGB), [H, W, 4] (RGB, premultiplied, and A) or [H, W, C] with C named
+    channels as a ZIP-compressed EXR.
 
     colour_space: one of COLOUR_SPACES ("data": no colour). half: 16-bit floats, clamped to +-65504. attributes are
     stored as "limn:<name>". latlong marks an environment map. layout: one of LAYOUTS; mipmap halves the picture down to
@@ -48,9 +49,9 @@ def write_exr(
     shape, for values that are not finite, or when the file does not read back as written.
     """
     array = np.asarray(array)
-    depth = len(channels) or 3
-    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != depth) or array.size == 0:
-        raise LimnError(f"{path}: an EXR is [H, W] or [H, W, {depth}], got {array.shape}")
+    depths = (len(channels),) if channels else (3, 4)
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in depths) or array.size == 0:
+        raise LimnError(f"{path}: an EXR is [H, W] or [H, W, {depths[0]}], got {array.shape}")
     if not np.isfinite(array).all():
         raise LimnError(f"{path}: {np.count_nonzero(~np.isfinite(array))} values are not finite")
     if half:
@@ -113,7 +114,7 @@ def _write_mipmaps(path: Path | str, pixels: np.ndarray, header: dict) -> None:
 
 
 def _channel(pixels: np.ndarray) -> str:
-    return "RGB" if pixels.ndim == 3 else "Y"
+    return {3: "RGB", 4: "RGBA"}[pixels.shape[2]] if pixels.ndim == 3 else "Y"
 
 
 def _header(colour_space: str, attributes: dict, latlong: bool) -> dict:
@@ -143,6 +144,16 @@ def read_exr(path: Path | str) -> np.ndarray:
         raise InputError("an EXR of other channels", where=str(path), got=", ".join(sorted(channels)) or "none",
                          expected="R, G, B or one channel")
     return (colour if colour.ndim == 2 else colour[..., :3]).astype(np.float32)
+
+
+def read_straight(path: Path | str) -> np.ndarray:
+    """-> float32 [H, W, 3] of an EXR whose colours are premultiplied by its alpha, without that; 0 where alpha is. As
+    stored where there is no alpha. Errors: as of read_exr."""
+    channels = _stored(path)
+    if "RGBA" not in channels:
+        return read_exr(path)
+    colours, alpha = channels["RGBA"][..., :3].astype(np.float32), channels["RGBA"][..., 3:].astype(np.float32)
+    return np.divide(colours, alpha, out=np.zeros_like(colours), where=alpha > 0.0)
 
 
 def read_channels(path: Path | str) -> dict[str, np.ndarray]:

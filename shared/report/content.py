@@ -24,7 +24,7 @@ from shared.report.eye_pictures import close_up_frames, eye_rectangle
 
 SELECTION_SECONDS = "model_selection_seconds.json"
 RESULT_FILES = {"sample_frames": "frames.json", "track_landmarks": "tracking.json", "inverse_render": "solve.json"}
-FRAMES_OF_OTHER_CLIPS = 3
+FRAMES_OF_OTHER_CLIPS = FRAMES_COMPOSED = 3
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,8 @@ class ReportContent:
     angles_deg [F, 3] yaw, pitch, roll and position_mm [F, 3] at frame_index [F]. excluded: (frame, stage, reason).
     views: None when they were not wished; relit_eyes: where its relit pictures show both eyes, as Frame.eyes. eyes,
     actions: of the mesh, or none; hair: what stands off the head, a mesh with the maps hair_albedo and hair_alpha, or
-    None. selection: the models tried, one dictionary each, in order. residuals: nested
+    None. composites {frame: [H, W, 3] linear}: crops with the re-render in the old head's place. selection: the models
+    tried, one dictionary each, in order. residuals: nested
     dictionaries of numbers. iterations: one dictionary of numbers each. warnings: (stage, text). parameters: (stage,
     name, value). clips: all but the first, where there are several. methods: paragraphs and references.
     """
@@ -98,6 +99,7 @@ class ReportContent:
     eyes: Sequence[Eyeball] = ()
     actions: Sequence[BlendShape] = ()
     hair: Mesh | None = None
+    composites: Mapping[int, np.ndarray] = field(default_factory=dict)
     overlay: np.ndarray | None = None
     shape: np.ndarray | None = None
     chart: np.ndarray | None = None
@@ -136,7 +138,7 @@ class ReportInputs:
     vertices in the whole one; record: the content of run.json; files: (name, text) pairs; views: None when they were
     not wished; clips: all but the first, where there are several; methods: paragraphs, references; eyes: the right and
     the left eyeball of the whole mesh, where poses say how they look, or none; actions: its blend shapes; hair: what
-    stands off the head, a mesh, or None.
+    stands off the head, a mesh, or None; composites: as in ReportContent.
     """
 
     name: str
@@ -156,6 +158,7 @@ class ReportInputs:
     eyes: Sequence[Eyeball] = ()
     actions: Sequence[BlendShape] = ()
     hair: Mesh | None = None
+    composites: Mapping[int, np.ndarray] = field(default_factory=dict)
 
 
 def result_content(result: ReportInputs, frame_count: int) -> ReportContent:
@@ -182,6 +185,7 @@ def result_content(result: ReportInputs, frame_count: int) -> ReportContent:
         eyes=result.eyes,
         actions=result.actions,
         hair=result.hair,
+        composites=result.composites,
         mesh=result.mesh,
         normals=result.normals,
         frame_index=poses["frame_index"],

@@ -87,6 +87,7 @@ def report_html(content: ReportContent) -> str:
         "frames": frames,
         "error_range": ERROR_RANGE,
         "eyes": eyes,
+        "composites": composites(content.composites),
         "relit_eyes": relit_eyes(content.views, content.relit_eyes),
         "maps": map_pictures(content.maps),
         "shape": _one(content.shape, SHEET_PIXELS, "the shape from three sides", _SHAPE),
@@ -149,6 +150,12 @@ def eye_close_ups(frame: Frame) -> list[Figure]:
     text = f", frame {frame.frame_index}, {'held out' if frame.held_out else 'fitted'}"
     return [Figure(jpeg_uri(close_up(picture, frame.eyes)), f"the eyes, {title.lower()}{text}", title, text)
             for title, picture in (("Clip", frame.clip), ("Re-render", frame.render))]
+
+
+def composites(pictures: Mapping[int, np.ndarray]) -> list[Figure]:
+    """Frames of the clip, {frame: [H, W, 3] linear}, with the re-render in the old head's place."""
+    return [Figure(jpeg_uri(shrunk(srgb_bytes(picture), MAP_PIXELS)), f"re-render in frame {frame}", f"Frame {frame}")
+            for frame, picture in pictures.items()]
 
 
 def relit_eyes(views: ViewSet | None, rectangle: tuple[int, int, int, int] | None) -> list[Figure]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from browser import DESKTOP, PHONE, needs_browser, visit
 from shapes import sphere
-from toy_result import FRAMES, ToyJob, toy_poses, write_toy_work
+from toy_result import FRAMES, RENDERED, ToyJob, toy_poses, write_toy_work
 
 from shared.geometry.blend_shapes import BlendShape
 from shared.geometry.mesh import subdivide, vertex_normals
@@ -96,6 +96,11 @@ def test_page_says_what_was_found(page):
                   "50\u00b0 to the left", "Models tried", "The colour chart as found",
                   "light, cubemap 16", "specular map, one value"):
         assert words in shown, words
+
+
+def test_composites_have_a_section(page):
+    text = read(page)
+    assert "composites" in text.ids and all(f"Frame {frame}" in text.text for frame in RENDERED)
 
 
 def test_data_of_the_slider(page):
@@ -287,6 +292,8 @@ def test_gathering_of_warnings_and_left_out_frames(tmp_path):
          "Correct capture.moves"),
         ("the colour chart in frame 6 is not used: its grey patches are overexposed: expose darker", "chart.png"),
         ("the grey place at (12, 30) is not used: its red is 3.20 and its blue 0.90 times its green", "nobody walks"),
+        ("person masks miss much of the head in 2 of 8 re-rendered frames: the alpha of these is the mesh's alone",
+         "plain background"),
         ("3 edges join faces of opposite winding", "Clean the mesh"),
         ("clip sun lies 2.1 px beside the shared mesh: other lens, another expression?", "its own lens"),
     ],
