@@ -15,6 +15,7 @@ Measures: geometry_mm    distance of the true face's points to the result's surf
          gaze, rerender_eyes where the truth has living eyes: degrees between directions, blinks found, and the PSNR on
                          eyes and lids, of which held_out are frames that the solver did not see
          labels          where the truth has labels: intersection over union of skin, hair, cloth and others
+         hair_outline_mm where hair stands before the background: from the true outline to the result's
          lid_margins_mm  with living eyes: between the borders of what lids leave open, as the camera sees them
 Frames:  the result's head frame and scale may be any; it is aligned by a similarity transform (camera centres first,
          then trimmed ICP on the face).
@@ -46,6 +47,7 @@ from shared.io.meshes import load_mesh, read_obj
 from shared.tracking.models import load_head_model
 from tools.scoring import align, gaze, labels, lid_margins, measures
 from tools.scoring.buffers import BufferRenderer
+from tools.scoring.hair_outline import hair_outline_errors
 from tools.scoring.table import table
 from tools.scoring.texel_albedo import albedo_pairs
 
@@ -114,6 +116,8 @@ def score(
     if labels.label_files(subject / "gt" / "frames") and (export / "maps" / "material.exr").exists():
         scores["labels"] = labels.label_scores(subject / "gt" / "frames", export, result.mesh, result.poses,
                                                result.intrinsics)
+        outline = hair_outline_errors(subject / "gt" / "frames", export, result.mesh, result.poses, result.intrinsics)
+        scores |= {} if outline is None else {"hair_outline_mm": outline}
     scores |= score_light(subject, export)
     return {"subject": subject.resolve().name, "result": str(export), **scores}
 

@@ -71,6 +71,10 @@ def _label_lines(scores: dict) -> list[tuple[str, str]]:
     rows = [(f"labels, {where}", ", ".join(f"{name} {value:.3f}" for name, value in own[where].items()))
             for where in ("texels", "pixels")]
     covered = ", ".join(f"{name} {value:.1%}" for name, value in own["covered"].items())
+    if "hair_outline_mm" in scores:
+        outline = scores["hair_outline_mm"]
+        rows.append(("hair outline", f"off by {_spread(outline)} mm, outwards {outline['outwards']:.3g}, "
+                                     f"{outline['frames']} frames"))
     return [*rows, ("labels", f"{own['unknown']:.1%} of the texels unknown; pixels that the mesh covers: {covered}")]
 
 
