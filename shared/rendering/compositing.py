@@ -71,8 +71,7 @@ def head_layers(frame: np.ndarray, person: np.ndarray, coverage: np.ndarray) -> 
     if agreed < LEAST_AGREED:
         return HeadLayers(frame, coverage.astype(np.float32), np.zeros((*head.shape, 4), np.float32), agreed)
     strip = max(2, round(STRIP_SHARE * max(head.shape)))
-    margin = unsure_px(head.shape)
-    own = _closed(person | _thick(head & ~person, strip), margin)
+    own = _closed(person | _thick(head & ~person, strip), unsure_px(head.shape))
     body = _thick(own & ~head, strip)
     inner = _from_background(own, strip)
     outline = np.minimum(blurred(coverage.astype(np.float32), _blur_px(frame, own, strip)), person_matte(frame, own))
@@ -80,9 +79,11 @@ def head_layers(frame: np.ndarray, person: np.ndarray, coverage: np.ndarray) -> 
     alpha = outline * (1.0 - seam)
     # Of what the re-render leaves open, the outline's share shows the background, and the seam's the frame.
     behind = (1.0 - outline + _NEARLY_NONE) / (1.0 - alpha + _NEARLY_NONE)
-    fringe = _grown((coverage > 0.0) | (own & ~body & _grown(head, strip)), margin + 1) & ~_grown(body, strip // 2)
+    # Loose hair beyond the mask is the old head's, too: a few pixels of background go with it.
+    beyond = strip // 2 + 1
+    fringe = _grown((coverage > 0.0) | (own & ~body & _grown(head, strip)), beyond) & ~_grown(body, strip // 2)
     share = (blurred(fringe.astype(np.float32), 1.0) * (1.0 - inner) * behind)[..., None]
-    patch = np.concatenate([share * continued(frame, ~_grown(own, margin + 1)), share], axis=-1).astype(np.float32)
+    patch = np.concatenate([share * continued(frame, ~_grown(own, beyond)), share], axis=-1).astype(np.float32)
     return HeadLayers(frame, alpha.astype(np.float32), patch, agreed)
 
 
