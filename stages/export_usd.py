@@ -5,7 +5,8 @@ Reads    sample_frames: frames.json, the frames and masks (for plates, alpha and
          poses.npz, renders, solve.json. Of all of them manifest.json and provenance.json. Of several clips the first is
          exported, and the light of each.
 Writes   head.usda with its payload, head.usdz, head.glb, mesh.obj, hair.obj, maps/*.exr, envmap.exr, envmaps/*.exr,
-         poses.npz, plates/*.jpg, renders/*.exr, patches/*.exr, views/*.exr, run.json, methods.txt, report.html.
+         poses.npz, plates/*.jpg, renders/*.exr, layers/*.exr, patches/*.exr, views/*.exr, run.json, methods.txt,
+         report.html.
 Method   The head model's facial actions are carried over to the solved head, where the mesh is the model's, and written
          as blend shapes. Edges of the full mesh are collapsed to meshes of fewer faces; the head model's quads are laid
          under it as a subdivision surface, and what it has beyond that becomes a displacement map. Units, axes, colour
@@ -55,9 +56,10 @@ STAGE = Stage(
         Output("poses.npz", "the head's pose in each frame, the lens, and where the eyes look", "mm",
                fields=EXPORTED_POSES),
         Output("plates/*.jpg", "the clip's crops, sRGB; absent when plates is off", space="crop", optional=True),
-        Output("renders/*.exr", "re-renders in full source frames, premultiplied by their alpha",
+        Output("renders/*.exr", "re-renders in full source frames", colour_space="in each file"),
+        Output("layers/*.exr", "the same with an alpha and premultiplied by it, to lay over the clip's frames",
                colour_space="in each file"),
-        Output("patches/*.exr", "what covers the old head's fringe: between the clip's frame and its re-render",
+        Output("patches/*.exr", "what covers the old head's fringe: between the clip's frame and its layer",
                colour_space="in each file"),
         Output("views/*.exr", "novel and relit views, and the lights of the latter; absent when views is off",
                colour_space="in each file", optional=True),
@@ -178,8 +180,9 @@ def write_images(job: Job, writer, maps: dict, envmap) -> None:
 
 
 def write_renders(job: Job, writer, mesh, alpha, poses: dict, frames, solve: dict) -> tuple[dict, list[str]]:
-    """renders/ and patches/ -> {frame: [H, W, 3], a few of the crops with the re-render in the old head's place}, and
-    sentences about alpha. mesh: the head's with what stands off it, alpha [S, T] how much of it is there, None: all."""
+    """renders/, layers/ and patches/ -> {frame: [H, W, 3], a few of the crops with the re-render in the old head's
+    place}, and sentences about alpha. mesh: the head's with what stands off it, alpha [S, T] how much of it is there,
+    None: all."""
     import numpy as np
 
     from shared.imaging.image_sampling import SurfaceViewer
@@ -193,7 +196,7 @@ def write_renders(job: Job, writer, mesh, alpha, poses: dict, frames, solve: dic
     viewer, lens = SurfaceViewer.of(mesh), poses.get("intrinsics_crop", frames.intrinsics)
     place = {int(frame): f for f, frame in enumerate(poses["frame_index"])}
     composites, apart = {}, []
-    for name in ("renders", "patches"):
+    for name in ("renders", "layers", "patches"):
         (job.out / name).mkdir()
     for frame in job.progress(solve["render_frames"], "renders"):
         render = read_exr(job.input("inverse_render") / "renders" / f"{frame:06d}.exr")
@@ -204,9 +207,10 @@ def write_renders(job: Job, writer, mesh, alpha, poses: dict, frames, solve: dic
         apart += [frame] if layers.agreed < LEAST_AGREED else []
         if frame in shown:
             composites[frame] = layers.composite(render)
-        for name, layer in (("renders", layers.premultiplied(render)), ("patches", layers.patch)):
-            full = paste_crop(layer, frames.crop, frames.source_size)
-            writer.write_colour(job.out / name / f"{frame:04d}.exr", full, "radiance, clip maximum 1; premultiplied")
+        pictures = {"renders": render, "layers": layers.premultiplied(render), "patches": layers.patch}
+        for name, picture in pictures.items():
+            full = paste_crop(picture, frames.crop, frames.source_size)
+            writer.write_colour(job.out / name / f"{frame:04d}.exr", full, "radiance, clip maximum 1")
     told = f"person masks miss much of the head in {len(apart)} of {len(solve['render_frames'])} re-rendered frames: "
     return composites, [told + "the alpha of these is the mesh's alone"] if apart else []
 

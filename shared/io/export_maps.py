@@ -90,10 +90,10 @@ class MapWriter:
 
     def write_colour(self, path: Path, rgb: np.ndarray, unit: str, *, latlong: bool = False) -> None:
         """[H, W, 3] scene-linear Rec.709 -> EXR in colour_space; [H, W, 4]: premultiplied, and alpha."""
-        converted = acescg_from_rec709(rgb[..., :3]) if self.acescg else rgb[..., :3]
-        if rgb.shape[2] == 4:
-            converted = np.concatenate([converted, rgb[..., 3:]], axis=-1)
+        colours, alpha = rgb[..., :3], rgb[..., 3:]
+        converted = np.concatenate([acescg_from_rec709(colours) if self.acescg else colours, alpha], axis=-1)
         extra = {"layout": "+y top row, +z centre, +x left of it"} if latlong else {}
+        extra |= {"alpha": "premultiplied"} if alpha.size else {}
         self._write(path, converted, self.colour_space, {"unit": unit, **extra}, latlong=latlong)
 
     def write_map(self, folder: Path, name: str, values: np.ndarray) -> None:

@@ -146,16 +146,6 @@ def read_exr(path: Path | str) -> np.ndarray:
     return (colour if colour.ndim == 2 else colour[..., :3]).astype(np.float32)
 
 
-def read_straight(path: Path | str) -> np.ndarray:
-    """-> float32 [H, W, 3] of an EXR whose colours are premultiplied by its alpha, without that; 0 where alpha is. As
-    stored where there is no alpha. Errors: as of read_exr."""
-    channels = _stored(path)
-    if "RGBA" not in channels:
-        return read_exr(path)
-    colours, alpha = channels["RGBA"][..., :3].astype(np.float32), channels["RGBA"][..., 3:].astype(np.float32)
-    return np.divide(colours, alpha, out=np.zeros_like(colours), where=alpha > 0.0)
-
-
 def read_channels(path: Path | str) -> dict[str, np.ndarray]:
     """{name: float32 [H, W]} of an EXR with channels of other names than R, G, B. Errors: as of read_exr."""
     return {name: plane.astype(np.float32) for name, plane in _stored(path).items()}

@@ -29,7 +29,7 @@ _ADVICE = (
      "Give the camera's own file, and film sharper, brighter and larger: light and shape can be no better than the "
      "poses."),
     (r"person masks miss",
-     "Look at the head's outline in those frames; film before a plain background that differs from hair and skin."),
+     "Look at the head's outline in layers/; film before a plain background that differs from hair and skin."),
     (r"poses given",
      "Check frame numbers, axes and the direction of the transforms (docs/files.md); poses that are only roughly right "
      "serve as a start with hold_poses: false."),

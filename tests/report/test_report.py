@@ -103,6 +103,11 @@ def test_composites_have_a_section(page):
     assert "composites" in text.ids and all(f"Frame {frame}" in text.text for frame in RENDERED)
 
 
+def test_folders_that_the_page_names_are_there(page):
+    named = re.findall(r"<code>(\w+)/</code>", page.read_text(encoding="utf-8"))
+    assert "layers" in named and "patches" in named and all((page.parent / folder).is_dir() for folder in named)
+
+
 def test_data_of_the_slider(page):
     text = page.read_text(encoding="utf-8")
     data = json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S).group(1))

@@ -42,7 +42,7 @@ from shared.geometry.raycast import RayScene
 from shared.geometry.surface import Surface
 from shared.imaging.color import decode_srgb
 from shared.io.arrays import load_arrays, read_json, write_json
-from shared.io.images import read_exr, read_png, read_straight
+from shared.io.images import read_exr, read_png
 from shared.io.meshes import load_mesh, read_obj
 from shared.tracking.models import load_head_model
 from tools.scoring import align, gaze, labels, lid_margins, measures
@@ -331,8 +331,8 @@ def find_image(folder: Path, stem: str) -> Path | None:
 
 
 def read_linear(path: Path) -> np.ndarray:
-    """[H,W,3] linear pixels of an EXR, not multiplied by its alpha, or of an sRGB PNG."""
-    return read_straight(path) if path.suffix == ".exr" else decode_srgb(read_png(path) / 255.0)
+    """[H,W,3] linear pixels of an EXR or of an sRGB PNG."""
+    return read_exr(path) if path.suffix == ".exr" else decode_srgb(read_png(path) / 255.0)
 
 
 def main(arguments: list[str] | None = None) -> int:

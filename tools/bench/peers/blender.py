@@ -27,7 +27,7 @@ from shared.geometry.raycast import RayScene, camera_hits
 from shared.imaging.color import encode_srgb
 from shared.inverse.problem import FACE_SKIN
 from shared.io.arrays import load_arrays, read_json
-from shared.io.images import read_exr, read_straight, write_png
+from shared.io.images import read_exr, write_png
 from shared.io.meshes import load_mesh
 from tools.scoring import measures
 
@@ -96,7 +96,7 @@ class Agreement:
 
 def compare_render(run: Path, python: Path, frame: int, width: int, samples: int) -> Agreement:
     """Renders frame through the asset's camera and compares it with export/renders."""
-    ours = read_straight(run / "export" / "renders" / f"{frame:04d}.exr")
+    ours = read_exr(run / "export" / "renders" / f"{frame:04d}.exr")
     scale = width / ours.shape[1]
     size = (width, round(ours.shape[0] * scale))
     blender = probe(python, run / "export" / "head.usda", [frame], size, samples).renders[frame]
