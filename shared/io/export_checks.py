@@ -35,6 +35,7 @@ AGAIN = "export again: python -m stages.export_usd --subject SUBJECT --force"
 HAIR_OBJ = "hair.obj"
 _LAYERS = ("head.usda", "head_payload.usda", "head_geo.usdc", "head_mtl.usda")
 _LIGHTS = ("envmap.exr", "envmap_far.exr", "envmaps/*.exr", "views/*_light.exr")
+_WITH_ALPHA = ("layers/*.exr", "patches/*.exr")
 _RIGID_TOLERANCE = 1e-6
 _UNREADABLE = (AttributeError, IndexError, KeyError, OSError, RuntimeError, TypeError, ValueError, LimnError,
                Tf.ErrorException, zipfile.BadZipFile)
@@ -140,6 +141,7 @@ class _Checks:
     def headers(self) -> None:
         """Of every EXR: channels, colour space, unit, content."""
         maps, lights = {map_path(self.folder, name): name for name in MAPS}, set(self.files(*_LIGHTS))
+        layers = set(self.files(*_WITH_ALPHA))
         gaps: dict[str, list[str]] = {}
 
         def header(file: str) -> list[str]:
@@ -148,7 +150,7 @@ class _Checks:
             if missing and self.older:
                 gaps[file] = missing
             stated = [f"does not state {', '.join(missing)}"] if missing and not self.older else []
-            return stated + header_errors(part, maps.get(file, ""), file in lights)
+            return stated + header_errors(part, maps.get(file, ""), file in lights, file in layers)
 
         for file in self.files("*.exr", "*/*.exr"):
             self.of(file, header)

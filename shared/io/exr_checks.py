@@ -17,13 +17,13 @@ _FLOATS = (1, 2)
 _TOLERANCE = 1e-4
 
 
-def header_errors(part: ExrPart, map_name: str = "", latlong: bool = False) -> list[str]:
+def header_errors(part: ExrPart, map_name: str = "", latlong: bool = False, layer: bool = False) -> list[str]:
     """Sentences about what the header of an exported EXR gets wrong; empty when it is sound.
 
-    map_name: which of export_maps.MAPS it should be, "" for pictures, which may have an alpha; latlong: whether it is a
-    light.
+    map_name: which of export_maps.MAPS it should be, "" for pictures; latlong: whether it is a light; layer: whether it
+    is a picture with an alpha.
     """
-    errors = _channel_errors(part, map_name) + _colour_errors(part, map_name)
+    errors = _channel_errors(part, map_name, layer) + _colour_errors(part, map_name)
     content = part.values.get(CONTENT, map_name)
     if map_name and content != map_name:
         errors.append(f"states {content} as its content ({CONTENT}), expected {map_name}")
@@ -41,13 +41,13 @@ def header_gaps(part: ExrPart, map_name: str = "", latlong: bool = False) -> lis
     return [name for name in wanted if part.values.get(name, "") == ""]
 
 
-def _channel_errors(part: ExrPart, map_name: str) -> list[str]:
+def _channel_errors(part: ExrPart, map_name: str, layer: bool) -> list[str]:
     names = {channel.name for channel in part.channels}
     kind = MAPS[map_name][0] if map_name in MAPS else ""
-    expected = CHANNELS if kind == "materials" else "Y" if kind == "data" and map_name != "normal" else "RGB"
+    colours = "RGBA" if layer else "RGB"
+    expected = CHANNELS if kind == "materials" else "Y" if kind == "data" and map_name != "normal" else colours
     errors = []
-    layered = not map_name and names == set("RGBA")
-    if names != set(expected) and not layered:
+    if names != set(expected):
         errors.append(f"channels {', '.join(sorted(names))}, expected {', '.join(expected)}")
     if any(channel.kind not in _FLOATS or channel.step != (1, 1) for channel in part.channels):
         errors.append("not all channels are floats of full size")

@@ -111,6 +111,13 @@ def no_latlong(folder):
     write_exr(folder / "envmap.exr", np.ones((8, 8, 3)), colour_space="lin_rec709_scene", attributes=ATTRIBUTES)
 
 
+def picture(file, channels):
+    def plant(folder):
+        (folder / file).parent.mkdir(exist_ok=True)
+        write_exr(folder / file, half(channels=(channels,)), colour_space="lin_rec709_scene", attributes=ATTRIBUTES)
+    return plant
+
+
 def other_primaries(folder):
     stated = {"limn:unit": "x", "limn:content": "diffuse_albedo", "colorInteropID": "lin_rec709_scene"}
     raw_exr(folder / "maps" / "diffuse_albedo.exr", {"RGB": half(channels=(3,))},
@@ -164,6 +171,9 @@ FAULTS = [
     ("envmap.exr: radiance from -1", negative_light),
     ("envmap.exr: 8 x 8 of envmap None is no lat-long light", no_latlong),
     ("envmap.exr: does not state envmap", no_latlong),
+    ("renders/0003.exr: channels A, B, G, R, expected R, G, B", picture("renders/0003.exr", 4)),
+    ("layers/0003.exr: channels B, G, R, expected R, G, B, A", picture("layers/0003.exr", 3)),
+    ("patches/0003.exr: channels B, G, R, expected R, G, B, A", picture("patches/0003.exr", 3)),
     ("poses.npz: not all poses are rigid: 5 of 5, the first in frame 3", poses(camera_from_head=lambda p: p * 1.01)),
     ("poses.npz: not all poses are rigid", poses(camera_from_head=mirrored)),
     ("poses.npz: camera_from_head is (4, 4, 4), expected (5, 4, 4)", poses(camera_from_head=lambda p: p[1:])),
