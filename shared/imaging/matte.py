@@ -26,6 +26,9 @@ path-traced head: mean error of the share beside the outline 0.017 (root mean sq
 NOISE = 1e-2
 """Of a camera's linear light: sides whose colours differ by less are told apart by the mask alone."""
 _NOBODY = 1e-4
+"""Sums of weights below it are none."""
+_UNKNOWN_SPREAD = 1e6
+"""Variance of a side of which no pixel is near: beside any that colours have, so that the mask decides."""
 
 
 def unsure_px(size: tuple[int, int]) -> int:
@@ -37,10 +40,9 @@ def person_matte(rgb: np.ndarray, person: np.ndarray) -> np.ndarray:
     """float32 [H, W] in [0, 1]: the share of each pixel that a person covers. rgb [H, W, 3]: linear; person [H, W]
     bool: the mask. Beyond unsure_px from the mask's border it is the mask."""
     reach = unsure_px(person.shape)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
     mask = person.astype(np.uint8)
-    inside = cv2.erode(mask, disc, borderType=cv2.BORDER_REPLICATE) > 0
-    outside = cv2.dilate(mask, disc, borderType=cv2.BORDER_REPLICATE) == 0
+    inside = cv2.erode(mask, disc(reach), borderType=cv2.BORDER_REPLICATE) > 0
+    outside = cv2.dilate(mask, disc(reach), borderType=cv2.BORDER_REPLICATE) == 0
     own, own_spread = _near_colours(rgb, inside, NEAR_PX + 0.5 * reach)
     other, other_spread = _near_colours(rgb, outside, NEAR_PX + 0.5 * reach)
     expected = blurred(mask.astype(np.float32), BORDER_PX)
@@ -79,9 +81,13 @@ def _near_colours(rgb: np.ndarray, known: np.ndarray, sigma: float) -> tuple[np.
     near = np.maximum(total, _NOBODY)
     mean = blurred(rgb * weight[..., None], sigma) / near[..., None]
     square = blurred((rgb**2).sum(-1) * weight, sigma) / near
-    # Where no such pixel is near, nothing is known of that side: the mask decides.
-    spread = np.maximum(square - (mean**2).sum(-1), 0.0) / 3.0 + np.where(total < _NOBODY, 1e6, 0.0)
-    return mean, spread
+    spread = np.maximum(square - (mean**2).sum(-1), 0.0) / 3.0
+    return mean, np.where(total < _NOBODY, _UNKNOWN_SPREAD, spread)
+
+
+def disc(reach: int) -> np.ndarray:
+    """uint8 [2 reach + 1, 2 reach + 1]: 1 within reach px of the middle, to grow or shrink regions by."""
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
 
 
 def blurred(picture: np.ndarray, sigma: float) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from shared.imaging.color import encode_srgb
-from shared.imaging.matte import blurred, continued, person_matte, unsure_px
+from shared.imaging.matte import BORDER_PX, blurred, continued, disc, person_matte, unsure_px
 from shared.imaging.picture_detail import edge_width
 
 STRIP_SHARE = 0.02
@@ -26,7 +26,10 @@ re-render fades into the frame where the person goes on."""
 LEAST_AGREED = 0.8
 """Share of the head that lies on the person; with less the mask is another's, or of nothing."""
 LARGEST_BLUR_PX = 2.0
-_HALF, _NEARLY_NONE = 0.5, 1e-3
+"""Blur by more is motion, along some edges only, or no edge at all: alpha is not drawn after it."""
+_HALF = 0.5
+_NEARLY_NONE = 1e-3
+"""Beside shares whose quotient is wanted: with both none it is 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +51,7 @@ class HeadLayers:
     def premultiplied(self, render: np.ndarray) -> np.ndarray:
         """float32 [H, W, 4]: a re-render [H, W, 3] linear, not darkened where the head covers a pixel in part and 0
         beside it, times alpha, and alpha. Its outermost colours go on where the frame's blur carries them."""
-        colours = np.where((render > 0.0).any(-1)[..., None], render, continued(render, (render > 0.0).any(-1)))
-        alpha = self.alpha[..., None]
+        colours, alpha = continued(render, (render > 0.0).any(-1)), self.alpha[..., None]
         return np.concatenate([colours * alpha, alpha], axis=-1).astype(np.float32)
 
     def composite(self, render: np.ndarray) -> np.ndarray:
@@ -82,7 +84,7 @@ def head_layers(frame: np.ndarray, person: np.ndarray, coverage: np.ndarray) -> 
     # Loose hair beyond the mask is the old head's, too: a few pixels of background go with it.
     beyond = strip // 2 + 1
     fringe = _grown((coverage > 0.0) | (own & ~body & _grown(head, strip)), beyond) & ~_grown(body, strip // 2)
-    share = (blurred(fringe.astype(np.float32), 1.0) * (1.0 - inner) * behind)[..., None]
+    share = (blurred(fringe.astype(np.float32), BORDER_PX) * (1.0 - inner) * behind)[..., None]
     patch = np.concatenate([share * continued(frame, ~_grown(own, beyond)), share], axis=-1).astype(np.float32)
     return HeadLayers(frame, alpha.astype(np.float32), patch, agreed)
 
@@ -111,18 +113,15 @@ def _from_background(person: np.ndarray, strip: int) -> np.ndarray:
 
 def _thick(region: np.ndarray, strip: int) -> np.ndarray:
     """The parts of a region [H, W] bool that a disc a strip wide fits into; it goes on beyond the picture."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (strip + 1 - strip % 2,) * 2)
     wide = cv2.copyMakeBorder(region.astype(np.uint8), strip, strip, strip, strip, cv2.BORDER_REPLICATE)
-    return cv2.morphologyEx(wide, cv2.MORPH_OPEN, disc)[strip:-strip, strip:-strip] > 0
+    return cv2.morphologyEx(wide, cv2.MORPH_OPEN, disc(strip // 2))[strip:-strip, strip:-strip] > 0
 
 
 def _closed(region: np.ndarray, reach: int) -> np.ndarray:
     """A region [H, W] bool without its holes and inlets up to 2 reach px wide."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
-    return cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
+    return cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_CLOSE, disc(reach)) > 0
 
 
 def _grown(region: np.ndarray, reach: int) -> np.ndarray:
     """A region [H, W] bool with what lies within reach px of it."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
-    return cv2.dilate(region.astype(np.uint8), disc) > 0
+    return cv2.dilate(region.astype(np.uint8), disc(reach)) > 0

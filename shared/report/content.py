@@ -24,7 +24,8 @@ from shared.report.eye_pictures import close_up_frames, eye_rectangle
 
 SELECTION_SECONDS = "model_selection_seconds.json"
 RESULT_FILES = {"sample_frames": "frames.json", "track_landmarks": "tracking.json", "inverse_render": "solve.json"}
-FRAMES_OF_OTHER_CLIPS = FRAMES_COMPOSED = 3
+FRAMES_OF_OTHER_CLIPS = 3
+FRAMES_COMPOSED = 3
 
 
 @dataclass(frozen=True)

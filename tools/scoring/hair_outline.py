@@ -26,6 +26,7 @@ from tools.scoring.measures import summary
 FINER = 4
 """Parts of a pixel along an edge in which outlines are drawn."""
 SAMPLES = 4
+"""Rays along each edge of a pixel that tell how much of it the result covers."""
 BORDER_PX = 3
 """Beside the picture's border nothing is an outline."""
 
