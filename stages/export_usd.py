@@ -28,7 +28,7 @@ from shared.errors import LimnError
 
 STAGE = Stage(
     name="export_usd",
-    version=17,
+    version=18,
     help="The head as USD, glTF, OBJ and EXR, with a report to judge it by.",
     inputs=("sample_frames", "track_landmarks", "init_albedo", "inverse_render"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),

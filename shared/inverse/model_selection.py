@@ -73,7 +73,7 @@ def select(
         records.append(record)
         fall = "" if record["fall"] is None else f", {-record['fall']:+.6f} +- {record['standard_error']:.6f}"
         said = "accepted" if record["accepted"] else "not accepted"
-        said += ", since held-out frames leave it open" if record["open"] else ""
+        said += ", where held-out frames leave it open" if record["open"] else ""
         text = f"{record['part']} {record['candidate']}: {record['held_out']:.6f} held out{fall}"
         context.note(f"model selection: {text}; {said} ({record['seconds']:.1f} s)")
 

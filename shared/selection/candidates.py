@@ -12,8 +12,9 @@ before it, then highlights, and with these, which show a lamp that matt skin may
 What is judged is the mean absolute error on held-out frames, paired frame by frame, with what the prior on skin says
 against the albedo: where no frame tells light from albedo, shading that ends in the albedo would cost nothing. A
 candidate must let that fall by a share that is worth its unknowns. Where the fall lies within its standard error of
-that share, the frames leave it open, and the fuller model is taken. Candidates are not all nested (a sun in the sky is
-no special case of harmonics), so that the one beyond a candidate that did not serve is tried, too.
+that share, the frames leave it open, and the fuller model is taken, but of cubemaps the coarser. Candidates are not all
+nested (a sun in the sky is no special case of harmonics), so that the one beyond a candidate that did not serve is
+tried, too.
 
 docs/selection.md derives this, and says what of the marginal likelihood it leaves out.
 
@@ -120,12 +121,13 @@ class Decision(Enum):
 
     SERVES = "serves"
     OPEN = "open"
-    """They cannot tell: of two models the fuller is taken, since what it has too much costs time alone."""
+    """They cannot tell: of two models the fuller is taken, since what it lacks would go into the albedo, and what it
+    has too much costs time alone. A finer cubemap is not: a lamp's shape shows, or there is none."""
     DOES_NOT = "does not serve"
 
-    @property
-    def accepted(self) -> bool:
-        return self is not Decision.DOES_NOT
+    def accepts(self, candidate: str) -> bool:
+        """Whether the candidate is taken."""
+        return self is Decision.SERVES or self is Decision.OPEN and candidate not in FINE_LIGHTS
 
 
 def judge(before: np.ndarray, after: np.ndarray, worthwhile: float) -> Decision:
@@ -181,7 +183,7 @@ class ModelSelection:
             trial = self._try(model, self.present.solution)
             decision = judge(self.present.errors, trial.errors, WORTHWHILE[part])
             self.report(describe(part, name, trial, self.present, decision))
-            if decision.accepted:
+            if decision.accepts(name):
                 self.present, selected, missed = trial, True, 0
             else:
                 missed += 1
@@ -229,7 +231,7 @@ def describe(
         "held_out": float(trial.errors.mean()),
         "fall": fall,
         "standard_error": standard_error,
-        "accepted": decision.accepted,
+        "accepted": decision.accepts(candidate),
         "open": decision is Decision.OPEN,
         "seconds": round(trial.seconds, 3),
     }

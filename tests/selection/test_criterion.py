@@ -122,6 +122,10 @@ class Comparison:
     def decision(self, errors):
         return judge(*errors, WORTHWHILE["light"])
 
+    @property
+    def accepted(self):
+        return self.decision(self.joint).accepts("harmonics_4")
+
 
 @cache
 def compared(seed, order, moves, extra):
@@ -182,10 +186,10 @@ def test_unknowns_that_follow_noise_alone_are_not_worth_their_while(order):
     """Of thirty heads that turn at most two are given 5, or 21, harmonics that are not there. If any fall at all were
     enough, many decisions would stay open, and take them."""
     found = heads(order, "head", 0.0)
-    assert sum(some.decision(some.joint).accepted for some in found) <= 2
+    assert sum(some.accepted for some in found) <= 2
     assert max(some.evidence for some in found) < -5.0
     if order == 2:
-        assert sum(judge(*some.joint, 0.0).accepted for some in found) > SEEDS / 3
+        assert sum(judge(*some.joint, 0.0).accepts("harmonics_4") for some in found) > SEEDS / 3
 
 
 @pytest.mark.parametrize("order, extra", [(2, 0.2), (4, 0.05)])
@@ -207,14 +211,14 @@ def test_where_no_frame_tells_light_from_albedo_the_likelier_albedo_wins():
 
 def test_a_likely_albedo_keeps_the_simple_model_where_no_frame_tells():
     found = heads(2, "camera", 0.0)
-    assert sum(some.decision(some.joint).accepted for some in found) <= 1
+    assert sum(some.accepted for some in found) <= 1
     assert max(some.evidence for some in found) < 0.0
 
 
 def test_weak_unknowns_that_are_there_are_taken_earlier_than_by_their_marginal_likelihood():
     """What their volumes would cost is no reason to leave them out."""
     found = [some for some in heads(4, "head", 0.01) if some.evidence < -5.0]
-    assert len(found) > SEEDS / 2 and np.mean([some.decision(some.joint).accepted for some in found]) > 0.7
+    assert len(found) > SEEDS / 2 and np.mean([some.accepted for some in found]) > 0.7
 
 
 CASES = [
@@ -226,7 +230,7 @@ CASES = [
 def test_models_rank_as_by_their_marginal_likelihood():
     """Where that is clear, a hundred to one and more."""
     found = [some for case in CASES for some in heads(*case) if abs(some.evidence) > np.log(100.0)]
-    agree = [some.decision(some.joint).accepted == (some.evidence > 0.0) for some in found]
+    agree = [some.accepted == (some.evidence > 0.0) for some in found]
     assert len(found) > 5 * SEEDS and np.mean(agree) >= 0.97
     assert 0.2 < np.mean([some.evidence > 0.0 for some in found]) < 0.8
 
@@ -245,4 +249,4 @@ def test_without_the_volumes_an_albedo_that_is_likelier_by_chance_can_win():
     """The known limit: 21 harmonics that are not there explain some of the albedo of a still head."""
     found = heads(4, "camera", 0.0)
     assert max(some.evidence for some in found) < -5.0
-    assert 0.15 < np.mean([some.decision(some.joint).accepted for some in found]) < 0.6
+    assert 0.15 < np.mean([some.accepted for some in found]) < 0.6

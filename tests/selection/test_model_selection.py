@@ -21,6 +21,7 @@ from shared.inverse.problem import InverseSettings
 from shared.report.content import selection_record
 from shared.report.page import selection_rows
 from shared.selection.candidates import (
+    FINE_LIGHTS,
     LIGHTS,
     WORTHWHILE,
     Decision,
@@ -80,7 +81,9 @@ def test_every_candidate_is_on_the_record_with_its_error_and_seconds(glossy):
     for record in records[1:]:
         assert record["fall"] == pytest.approx(held_out - record["held_out"], abs=1e-12)
         beyond, uncertain = record["fall"] - WORTHWHILE[record["part"]] * held_out, record["standard_error"]
-        assert record["open"] == (abs(beyond) <= uncertain) and record["accepted"] == (beyond >= -uncertain)
+        assert record["open"] == (abs(beyond) <= uncertain and record["fall"] > 0.0)
+        served = beyond > uncertain or record["open"] and record["candidate"] not in FINE_LIGHTS
+        assert record["accepted"] == served
         assert record["seconds"] > 0.0
         held_out = record["held_out"] if record["accepted"] else held_out
     assert held_out == pytest.approx(float(selection.present.errors.mean()))
@@ -127,7 +130,8 @@ def test_what_the_standard_error_leaves_open_takes_the_fuller_model():
     assert abs(gain(frames, after)[0]) < gain(frames, after)[1]
     assert judge(after, frames, 0.005) is Decision.OPEN
     assert judge(frames, after, 0.005) is Decision.DOES_NOT  # as uncertain, but if anything worse
-    assert Decision.OPEN.accepted and not Decision.DOES_NOT.accepted
+    assert Decision.OPEN.accepts("one_value") and not Decision.DOES_NOT.accepts("one_value")
+    assert Decision.SERVES.accepts("cubemap_16") and not Decision.OPEN.accepts("cubemap_16")
     assert judge(frames, frames - 0.00002, 0.005) is Decision.DOES_NOT  # all frames gain, but next to nothing
 
 
@@ -213,7 +217,7 @@ def test_a_decision_that_stays_open_says_so(one_thread, monkeypatch, select_on):
     monkeypatch.setattr(model_selection, "fit_all_points", lambda *_: None)
     chosen, _ = select_on(make_truth(specular=0.0)[0], notes.append, selection=frozenset({"samples"}))
     assert chosen.candidates[1]["open"] and chosen.candidates[1]["accepted"]
-    assert "accepted, since held-out frames leave it open" in notes[1]
+    assert "accepted, where held-out frames leave it open" in notes[1]
 
 
 def test_too_few_held_out_frames_choose_no_model(select_on):
