@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 
-from shared.geometry.mesh import diffused, mesh_edges
+from shared.geometry.mesh import Mesh, diffused, mesh_edges
 from shared.geometry.raycast import RayScene
 from shared.hair.hair_pixels import HAIR_PIXEL
 from shared.hair.shell_grid import ShellGrid
@@ -40,6 +40,11 @@ LEAST_COSINE = 0.05
 """Of a look that tells where hair ends: at its border it curves away."""
 BORDER_STEPS = 2
 """Edges beyond what is connected to the crown over which alpha may still run out."""
+HAIRLINE_STEPS, HAIRLINE_DEEP = 4, 0.9
+"""Of diffusion, which spread the border of hair by two edges or nine millimetres; and from which value on within that
+border hair hides the skin."""
+LIES_MM, STANDS_MM = 4.0, 10.0
+"""Thickness up to which hair lies on the skin and may let it be seen, and from which on it hides it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,5 +107,21 @@ def alpha_of(texels: TexelSurface, seen: SeenHair, share: np.ndarray) -> np.ndar
     own = (seen.looks * np.exp(seen.log_hair) + LEAST_SEEN * around) / (seen.looks + LEAST_SEEN)
     own = np.where(around > 0.0, own, 0.0)
     low, high = EDGE
-    step = np.clip((own - low) / (high - low), 0.0, 1.0)
-    return (step * step * (3.0 - 2.0 * step)).astype(np.float32)
+    return _smooth_step((own - low) / (high - low)).astype(np.float32)
+
+
+def at_hairline(grid: ShellGrid, mesh: Mesh, share: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """[V] in 0 .. 1: what alpha is multiplied by, where hair begins on the skull: there the head's own map shows how it
+    thins out, and a shell's edge before it would be a cut. share [V] of hair at the vertices of the grid's mesh; radius
+    [R, C] mm of the shell."""
+    within = diffused((share > 0.5).astype(float), mesh.faces, HAIRLINE_STEPS)
+    hides = _smooth_step((within - 0.5) / (HAIRLINE_DEEP - 0.5))
+    lies = 1.0 - np.clip((radius - grid.base - LIES_MM) / (STANDS_MM - LIES_MM), 0.0, 1.0)
+    lies[grid.domed:] = 0.0
+    return 1.0 - grid.of_vertices(lies) * (1.0 - hides)
+
+
+def _smooth_step(values: np.ndarray) -> np.ndarray:
+    """0 up to 0, 1 from 1 on, without corners between; values [...]."""
+    step = np.clip(values, 0.0, 1.0)
+    return step * step * (3.0 - 2.0 * step)

@@ -14,7 +14,7 @@ from shared.geometry.mesh import Mesh
 from shared.geometry.parts import mesh_part
 from shared.geometry.raycast import RAY_START_MM
 from shared.geometry.surface import Surface
-from shared.hair.coverage import alpha_of, covered, look_for_hair
+from shared.hair.coverage import alpha_of, at_hairline, covered, look_for_hair
 from shared.hair.hair_pixels import CLOTH_PIXEL, HairPixels
 from shared.hair.hull import LEAST_MM, hull_radius
 from shared.hair.joined import HAIR_ROUGHNESS, HairSurface, joined_alpha, joined_surface
@@ -117,7 +117,8 @@ def find_hair(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray, vi
     share = covered(grid, shell, look_for_hair(grid, shell, kinds, views))
     seen = look_for_hair(grid, shell, kinds, views, share)  # past what is before the face
     share = covered(grid, shell, seen)
-    alpha = shell.dilated(shell.to_image(alpha_of(shell, seen, share)))
+    thins = shell.interpolate(at_hairline(grid, shell.mesh, share, radius)[:, None])[:, 0]
+    alpha = shell.dilated(shell.to_image(thins * alpha_of(shell, seen, share)))
     thick = (radius - grid.base)[(grid.of_grid(share) > 0.5) & (said > 0.0)]
     if not len(thick):
         context.note("hair: no outline tells how far out it reaches: no surface of its own")

@@ -5,7 +5,7 @@ import pytest
 from shapes import nods, sphere
 
 from shared.geometry.raycast import RayScene, camera_hits, pixel_directions
-from shared.hair.coverage import alpha_of, covered, look_for_hair
+from shared.hair.coverage import alpha_of, at_hairline, covered, look_for_hair
 from shared.hair.shell_grid import ShellGrid
 from shared.imaging.texels import TexelSurface
 from shared.imaging.views import Views
@@ -110,3 +110,19 @@ def test_background_counts_only_where_it_is_faced(shell, views):
     grid, texels = shell
     share = covered(grid, texels, look_for_hair(grid, texels, kinds, views))
     assert share[texels.mesh.vertices[:, 1] > 40.0].min() > 0.9
+
+
+@pytest.mark.parametrize(("thickness_mm", "least"), [(3.0, 0.0), (8.0, 2.0 / 3.0), (15.0, 1.0)])
+def test_hair_that_lies_on_the_skull_thins_out_at_its_edge(shell, thickness_mm, least):
+    """To nothing at the hairline and beyond, all of it from three edges within; what stands off hides the skin."""
+    grid, texels = shell
+    height = texels.mesh.vertices[:, 1]
+    share = (height > HAIRLINE_MM).astype(float)
+    thins = at_hairline(grid, texels.mesh, share, grid.base + thickness_mm)
+    skull = grid.of_vertices(np.repeat((np.arange(len(grid.base)) < grid.domed)[:, None], grid.columns, 1)) > 0
+    edge_mm = SHELL_MM * np.radians(2.5)
+    beyond, within = skull & (height < HAIRLINE_MM), height > HAIRLINE_MM + 3.0 * edge_mm
+    assert thins[beyond] == pytest.approx(least, abs=0.02)
+    assert thins[within] == pytest.approx(1.0, abs=0.02) and (thins[~skull] == 1.0).all()
+    border = skull & (height > HAIRLINE_MM) & (height < HAIRLINE_MM + 2.0 * edge_mm)
+    assert least == 1.0 or least < thins[border].mean() < 0.95
