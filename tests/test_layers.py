@@ -28,7 +28,7 @@ MAY_IMPORT = {
     "shared.rendering": "compute geometry imaging",
     "shared.appearance": "compute geometry imaging capture rendering",
     "shared.shape": "compute geometry imaging tracking rendering appearance",
-    "shared.selection": "appearance",
+    "shared.selection": "imaging rendering appearance",
     "shared.published": "compute geometry imaging rendering appearance",
     "shared.inverse":
         "contract compute geometry imaging io capture hair tracking rendering appearance shape selection published",

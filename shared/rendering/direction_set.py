@@ -19,9 +19,9 @@ from shared.geometry.transforms import fibonacci_sphere
 PARTS = 16
 """Directions that one of the even set is split into: seven degrees become less than two."""
 
-CONCENTRATED = 0.02
-"""Share of a frame's light from one direction of an even set from which on it comes from a lamp. Of a room with a
-window it is below 0.01."""
+CONCENTRATED = 15.0
+"""Light of a frame from one direction of an even set, over the mean of all, from which on it comes from a lamp. Of a
+room with a window it is below 8: a share of the light would hang on how many directions there are."""
 
 
 def solid_angles(directions: np.ndarray) -> np.ndarray:
@@ -37,7 +37,7 @@ def widest_spacing(directions: np.ndarray) -> float:
 def concentrated(light_along: np.ndarray) -> np.ndarray:
     """[J] bool: along which directions of an even set a lamp shines in some frame; light_along [J, F, C] linear."""
     arriving = light_along.mean(2)
-    return (arriving / np.maximum(arriving.sum(0), 1e-12)).max(1) > CONCENTRATED
+    return (arriving / np.maximum(arriving.mean(0), 1e-12)).max(1) > CONCENTRATED
 
 
 def split_directions(directions: np.ndarray, chosen: np.ndarray, parts: int = PARTS) -> np.ndarray:

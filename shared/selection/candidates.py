@@ -35,6 +35,8 @@ import numpy as np
 from shared.appearance.fit import Solution, fit_appearance
 from shared.appearance.observations import Capture
 from shared.appearance.problem import AppearanceProblem, AppearanceSettings
+from shared.rendering.direction_set import concentrated
+from shared.rendering.shading import light_along
 
 LIGHTS = {
     "harmonics_2": ("harmonics_2", 8),
@@ -174,6 +176,8 @@ class ModelSelection:
                 break
             if (self.present.model.light, name) == ("sun_sky", "harmonics_4"):
                 continue  # which cannot show the sun
+            if name in FINE_LIGHTS and not self._shows_lamp():
+                break
             model = self.present.model._replace(**{part: name})
             # What a finer cubemap did not show of matt skin it does not show of glossy skin either.
             finer = part == "light" and self.present.model.light.startswith("cubemap")
@@ -188,6 +192,12 @@ class ModelSelection:
             else:
                 missed += 1
         return selected
+
+    def _shows_lamp(self) -> bool:
+        """Whether the present light has a lamp, whose shape is all that a finer cubemap could add."""
+        capture, light = self.capture, self.present.solution.state.light
+        along = light_along(light, capture.directions, capture.world_from_head, capture.light_index)
+        return bool(concentrated(along).any())
 
     def _patience(self, part: str) -> int:
         """How many candidates in a row may not serve: a cubemap that a finer one does not improve is fine enough."""

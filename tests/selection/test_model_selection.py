@@ -90,8 +90,9 @@ def test_every_candidate_is_on_the_record_with_its_error_and_seconds(glossy):
     assert len(selection.tried) == len(records)  # no model twice
 
 
-def tried_candidates(monkeypatch, error_of):
-    """What is tried, in order, where a model's error is as given for all frames."""
+def tried_candidates(monkeypatch, error_of, lamp=True):
+    """What is tried, in order, where a model's error is as given for all frames; lamp: whether lights have one."""
+    monkeypatch.setattr(ModelSelection, "_shows_lamp", lambda self: lamp)
     records, frames = [], np.linspace(0.99, 1.01, 9)
     monkeypatch.setattr(ModelSelection, "_try", lambda self, model,
                         start: Trial(model, None, error_of(model) * frames, 0.1))
@@ -104,6 +105,15 @@ def test_harmonics_are_passed_over_once_a_sun_serves(monkeypatch):
     found = tried_candidates(monkeypatch, lambda model: error[model.light])
     assert ("sun_sky", True) in found and "harmonics_4" not in dict(found)
     assert found[1:3] == [("cubemap_8", False), ("cubemap_16", False)]
+
+
+def test_a_finer_cubemap_is_tried_only_for_the_shape_of_a_lamp(monkeypatch, matte, glossy):
+    error = {"harmonics_2": 1.0, "sun_sky": 0.9, "harmonics_4": 0.9, "cubemap_8": 0.8, "cubemap_16": 0.1}
+    for lamp in (True, False):
+        assert ("cubemap_16" in dict(tried_candidates(monkeypatch, lambda model: error[model.light], lamp))) == lamp
+    monkeypatch.undo()
+    assert glossy[0]._shows_lamp() and not matte[0]._shows_lamp()
+    assert "cubemap_16" in {model.light for model in glossy[0].tried} - {model.light for model in matte[0].tried}
 
 
 @pytest.mark.parametrize("saved", [-0.001, 0.001])
