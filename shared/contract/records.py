@@ -202,8 +202,7 @@ _CANDIDATES = (
     Field("fall", "By how much that is less than before.", "number or null"),
     Field("standard_error", "Standard error of the fall.", "number or null"),
     Field("accepted", "Whether the choice was kept.", "bool"),
-    Field("open", "Whether the held-out frames left it open: then the fuller choice is kept, but of cubemaps the "
-          "coarser.", "bool"),
+    Field("open", "Whether the held-out frames left it open: then the fuller choice is kept.", "bool"),
 )
 
 

@@ -12,7 +12,7 @@ before it, then highlights, and with these, which show a lamp that matt skin may
 What is judged is the mean absolute error on held-out frames, paired frame by frame, with what the prior on skin says
 against the albedo: where no frame tells light from albedo, shading that ends in the albedo would cost nothing. A
 candidate must let that fall by a share that is worth its unknowns. Where the fall lies within its standard error of
-that share, the frames leave it open, and the fuller model is taken, but of cubemaps the coarser. Candidates are not all
+that share, the frames leave it open, and the fuller model is taken, unless the error rose. Candidates are not all
 nested (a sun in the sky is no special case of harmonics), so that the one beyond a candidate that did not serve is
 tried, too.
 
@@ -124,12 +124,12 @@ class Decision(Enum):
     SERVES = "serves"
     OPEN = "open"
     """They cannot tell: of two models the fuller is taken, since what it lacks would go into the albedo, and what it
-    has too much costs time alone. A finer cubemap is not: a lamp's shape shows, or there is none."""
+    has too much costs time alone."""
     DOES_NOT = "does not serve"
 
-    def accepts(self, candidate: str) -> bool:
-        """Whether the candidate is taken."""
-        return self is Decision.SERVES or self is Decision.OPEN and candidate not in FINE_LIGHTS
+    @property
+    def accepted(self) -> bool:
+        return self is not Decision.DOES_NOT
 
 
 def judge(before: np.ndarray, after: np.ndarray, worthwhile: float) -> Decision:
@@ -179,15 +179,13 @@ class ModelSelection:
             if name in FINE_LIGHTS and not self._shows_lamp():
                 break
             model = self.present.model._replace(**{part: name})
-            # What a finer cubemap did not show of matt skin it does not show of glossy skin either.
-            finer = part == "light" and self.present.model.light.startswith("cubemap")
-            if model in self.tried or finer and model._replace(specular="none") in self.tried:
+            if model in self.tried:
                 missed += 1
                 continue
             trial = self._try(model, self.present.solution)
             decision = judge(self.present.errors, trial.errors, WORTHWHILE[part])
             self.report(describe(part, name, trial, self.present, decision))
-            if decision.accepts(name):
+            if decision.accepted:
                 self.present, selected, missed = trial, True, 0
             else:
                 missed += 1
@@ -241,7 +239,7 @@ def describe(
         "held_out": float(trial.errors.mean()),
         "fall": fall,
         "standard_error": standard_error,
-        "accepted": decision.accepts(candidate),
+        "accepted": decision.accepted,
         "open": decision is Decision.OPEN,
         "seconds": round(trial.seconds, 3),
     }

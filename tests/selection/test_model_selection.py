@@ -21,7 +21,6 @@ from shared.inverse.problem import InverseSettings
 from shared.report.content import selection_record
 from shared.report.page import selection_rows
 from shared.selection.candidates import (
-    FINE_LIGHTS,
     LIGHTS,
     WORTHWHILE,
     Decision,
@@ -82,8 +81,7 @@ def test_every_candidate_is_on_the_record_with_its_error_and_seconds(glossy):
         assert record["fall"] == pytest.approx(held_out - record["held_out"], abs=1e-12)
         beyond, uncertain = record["fall"] - WORTHWHILE[record["part"]] * held_out, record["standard_error"]
         assert record["open"] == (abs(beyond) <= uncertain and record["fall"] > 0.0)
-        served = beyond > uncertain or record["open"] and record["candidate"] not in FINE_LIGHTS
-        assert record["accepted"] == served
+        assert record["accepted"] == (beyond > uncertain or record["open"])
         assert record["seconds"] > 0.0
         held_out = record["held_out"] if record["accepted"] else held_out
     assert held_out == pytest.approx(float(selection.present.errors.mean()))
@@ -140,8 +138,7 @@ def test_what_the_standard_error_leaves_open_takes_the_fuller_model():
     assert abs(gain(frames, after)[0]) < gain(frames, after)[1]
     assert judge(after, frames, 0.005) is Decision.OPEN
     assert judge(frames, after, 0.005) is Decision.DOES_NOT  # as uncertain, but if anything worse
-    assert Decision.OPEN.accepts("one_value") and not Decision.DOES_NOT.accepts("one_value")
-    assert Decision.SERVES.accepts("cubemap_16") and not Decision.OPEN.accepts("cubemap_16")
+    assert Decision.OPEN.accepted and not Decision.DOES_NOT.accepted
     assert judge(frames, frames - 0.00002, 0.005) is Decision.DOES_NOT  # all frames gain, but next to nothing
 
 
