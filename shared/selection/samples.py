@@ -52,7 +52,7 @@ class HalfSpread:
 
 
 @dataclass(frozen=True)
-class Samples:
+class NeededSamples:
     """frames of each light, and the sizes of the light's problem, which are enough; over_frames, over_points: why."""
 
     frames: int
@@ -63,7 +63,7 @@ class Samples:
 
 def enough_samples(
     capture: Capture, settings: AppearanceSettings, solution: Solution, frames: int, sizes: Sizes
-) -> Samples:
+) -> NeededSamples:
     """What of frames (of each light) and sizes a light needs that looks like the solution of a small capture."""
     over_frames = spread_over_frames(capture, settings, solution)
     over_points = spread_over_points(capture, settings, solution)
@@ -73,7 +73,7 @@ def enough_samples(
     own = Sizes(points, sizes.directions, sizes.nodes)
     if settings.resolutions[-1] <= SOFT_RESOLUTION:
         own = Sizes(points, SOFT_DIRECTIONS, SOFT_NODES)
-    return Samples(min(frames, wanted), sizes.at_most(own), over_frames, over_points)
+    return NeededSamples(min(frames, wanted), sizes.at_most(own), over_frames, over_points)
 
 
 def spread_over_frames(capture: Capture, settings: AppearanceSettings, solution: Solution) -> HalfSpread:
