@@ -269,8 +269,7 @@ def _add_products(rows, irradiance, derivative, error, weight, per_channel, toge
 
 def resolved_texels(surface: TexelSurface, views: Views) -> float:
     """Standard width in texels of what the pictures resolve of the texture where it is largest in them."""
-    px_per_mm = np.max(views.intrinsics[:, 0, 0]) / np.median(views.camera_from_head[:, 2, 3])
-    return max(RESOLVED_PX / WIDTH_OF_DEVIATION / float(px_per_mm * surface.typical_texel_mm()), LEAST_POOL)
+    return max(RESOLVED_PX / WIDTH_OF_DEVIATION / (views.px_per_mm * surface.typical_texel_mm()), LEAST_POOL)
 
 
 def normal_image(surface: TexelSurface, turn: np.ndarray | None) -> np.ndarray:

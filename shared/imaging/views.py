@@ -77,6 +77,11 @@ class Views:
         return self.read_mask(int(f))
 
     @property
+    def px_per_mm(self) -> float:
+        """Pixels on a millimetre of the head where it is largest in the pictures."""
+        return float(np.max(self.intrinsics[:, 0, 0]) / np.median(self.camera_from_head[:, 2, 3]))
+
+    @property
     def frames_of_lights(self) -> list[np.ndarray]:
         """Of each light, the indices of its frames."""
         return frames_of_lights(self.light_index, len(self))

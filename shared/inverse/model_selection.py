@@ -96,8 +96,7 @@ def fitting_map_size(surface: Surface, views: Views, most: int) -> int:
     on_face = np.ones(len(surface.mesh.faces), bool)
     if surface.face_segment is not None:
         on_face = surface.faces_of(FACE_SKIN)
-    px_mm = np.median(views.camera_from_head[:, 2, 3]) / np.max(views.intrinsics[:, 0, 0])
     size, texel_mm = most, float(np.median(texel_size(surface.mesh, most)[on_face]))
-    while size >= 2 * SMALLEST_MAP and 2.0 * texel_mm * TEXELS_PER_PX <= px_mm:
+    while size >= 2 * SMALLEST_MAP and 2.0 * texel_mm * TEXELS_PER_PX * views.px_per_mm <= 1.0:
         size, texel_mm = size // 2, 2.0 * texel_mm
     return size

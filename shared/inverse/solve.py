@@ -60,12 +60,13 @@ def solve_clip(
 
     # Light on the mesh as it was tracked, of the model that is chosen there where one is to be.
     selected = None if settings.selection is None else select(surface, views, settings, chart, context)
+    settings = settings if selected is None else selected.settings
+    light_views = some_views(views, settings, settings.light_frames)
     if selected is None:
-        lit = LitSurface.of(surface, some_views(views, settings, settings.light_frames), settings, chart, context)
+        lit = LitSurface.of(surface, light_views, settings, chart, context)
         solution = fit_appearance(lit.coarse, settings.appearance, report_to(context))
     else:
-        settings, lit, solution = selected.settings, selected.lit, selected.solution
-    light_views = some_views(views, settings, settings.light_frames)
+        lit, solution = selected.lit, selected.solution
 
     # A lamp that stands near, where held-out frames ask for one.
     by_lamp = find_lamp(lit, solution, light_views, settings, chart, context)

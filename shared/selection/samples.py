@@ -27,7 +27,8 @@ from shared.rendering.precomputed_transfer import Sizes
 from shared.selection.candidates import SELECTION_PRECISION
 
 TOLERANCE = 0.007
-"""Standard deviation of the log irradiance, by frames and by points each: both together 1 %, a tenth of dE2000."""
+"""Standard deviation of the log irradiance, by frames and by points each: both together 1 %, a quarter of a unit of
+CIELAB's lightness."""
 FEWEST_FRAMES, FEWEST_POINTS = 24, 1000
 """Three frames of 24 are held out to judge by; with fewer points a highlight falls between them."""
 FRAME_STEP, POINT_STEP = 8, 500

@@ -11,6 +11,7 @@ from shared.appearance.fit import fit_appearance
 from shared.appearance.problem import AppearanceSettings
 from shared.geometry.mesh import Mesh
 from shared.imaging.frame_index import halves
+from shared.imaging.views import Views
 from shared.inverse.model_selection import SMALLEST_MAP, TEXELS_PER_PX, fitting_map_size
 from shared.rendering.precomputed_transfer import Sizes
 from shared.selection import samples
@@ -82,15 +83,17 @@ def square(edge_mm):
     return SimpleNamespace(mesh=mesh, face_segment=None)
 
 
+def views_of(px_mm):
+    """Three frames whose pixels are so wide on the head."""
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 2, 3] = 1000.0 * px_mm
+    return Views.in_one_light(poses, np.diag([1000.0, 1000.0, 1.0]), (64, 64), "head", None, None)
+
+
 @pytest.mark.parametrize(("px_mm", "expected"), [(0.3, 2048), (0.71, 1024), (0.7, 2048), (1.42, 512), (9.0, 512)])
 def test_maps_are_as_fine_as_the_pixels_fill(px_mm, expected):
     """256 mm across: texels of 0.25 mm at 1024, which pixels of 0.25 sqrt(2) fill twice over at 2048 only."""
-    focal, depth = 1000.0, 1000.0 * px_mm
-    views = SimpleNamespace(
-        camera_from_head=np.tile(np.eye(4), (3, 1, 1)),
-        intrinsics=np.tile(np.diag([focal, focal, 1.0]), (3, 1, 1)),
-    )
-    views.camera_from_head[:, 2, 3] = depth
+    views = views_of(px_mm)
     size = fitting_map_size(square(512.0), views, 2048)
     assert size == expected
     texel_mm = 512.0 / size
@@ -99,6 +102,5 @@ def test_maps_are_as_fine_as_the_pixels_fill(px_mm, expected):
 
 
 def test_a_smaller_limit_stays():
-    views = SimpleNamespace(camera_from_head=np.eye(4)[None], intrinsics=np.eye(3)[None])
-    views.camera_from_head[:, 2, 3] = 1e6  # far away, so that little would do
+    views = views_of(1e6)  # so coarse that little would do
     assert fitting_map_size(square(256.0), views, 256) == 256
