@@ -24,7 +24,7 @@ MAY_IMPORT = {
     "shared.capture": "contract compute geometry imaging io",
     "shared.hair": "compute geometry imaging io",
     "shared.tracking": "contract compute geometry io capture",
-    "shared.actions": "geometry tracking",
+    "shared.actions": "compute geometry tracking",
     "shared.rendering": "compute geometry imaging",
     "shared.appearance": "compute geometry imaging capture rendering",
     "shared.shape": "compute geometry imaging tracking rendering appearance",

@@ -1,5 +1,5 @@
 """Facial actions of a solved head, carried over from the head model, as blend shapes.
 
 Read in this order: names, transfer, eyelids, folds, lips, facial.
-May import: geometry, tracking.
+May import: compute, geometry, tracking.
 """

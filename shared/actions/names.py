@@ -11,6 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 from scipy.spatial import cKDTree
 
+from shared.compute.smooth_step import smooth_step
 from shared.tracking.head_model import HeadModel
 
 ARKIT_NAMES = tuple(
@@ -64,8 +65,7 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 def _left_share(x: np.ndarray) -> np.ndarray:
     """[V]: 1 on the head's own left, 0 on its right, smooth over the middle; x [V] mm."""
-    way = np.clip(0.5 + 0.5 * x / MIDDLE_MM, 0.0, 1.0)
-    return way * way * (3.0 - 2.0 * way)
+    return smooth_step(0.5 + 0.5 * x / MIDDLE_MM)
 
 
 def _mirrored(template: np.ndarray, moves: np.ndarray) -> np.ndarray:

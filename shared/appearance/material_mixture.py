@@ -19,7 +19,7 @@ from shared.appearance.material_features import SurfaceFeatures
 from shared.compute.robust import ROBUST_SCALE
 from shared.geometry.mesh import diffused, mesh_edges
 from shared.geometry.surface import Surface
-from shared.imaging.material_labels import BROW, CLOTH, EYE, HAIR, LABELS, LIPS, SKIN, UNKNOWN
+from shared.imaging.material_labels import BROW, CLOTH, CLOTH_BELOW_MM, EYE, HAIR, LABELS, LIPS, SKIN, UNKNOWN
 
 SEEDS = ("nose", "cheek_left", "cheek_right", "forehead")
 """Mostly skin: where its distribution starts, at those of their vertices that look most alike."""
@@ -33,8 +33,6 @@ PRIORS = {
 """Skin, hair, cloth by segment, before the clip is looked at."""
 PRIOR_MM, BROW_MM, LIP_MM = 12.0, 3.0, 2.0
 """Over which the borders of segments are uncertain, and those of brows and lips."""
-CLOTH_BELOW_MM = (15.0, 45.0)
-"""Below the chin: where cloth may begin, and where it is as likely as it gets."""
 LOWEST_CLOTH, LEAST_CLOTH = 0.6, 0.02
 """Its probability down there, and what is left of the table's above."""
 FLOOR = np.array([0.22, 0.07, 0.07, 0.32, 0.45])
@@ -238,7 +236,8 @@ def _prior(surface: Surface) -> np.ndarray:
         np.add.at(count, mesh.faces[:, k], 1.0)
     prior = _spread(surface, sums / np.maximum(count, 1.0), PRIOR_MM)
     chin = mesh.vertices[mesh.faces[surface.faces_of(("chin",))], 1].min()
-    low = np.clip((chin - mesh.vertices[:, 1] - CLOTH_BELOW_MM[0]) / (CLOTH_BELOW_MM[1] - CLOTH_BELOW_MM[0]), 0.0, 1.0)
+    start, end = CLOTH_BELOW_MM
+    low = np.clip((chin - mesh.vertices[:, 1] - start) / (end - start), 0.0, 1.0)
     neck = surface.vertices_of(("neck",)) & (low > 0)
     cloth = np.where(neck, LOWEST_CLOTH * low, LEAST_CLOTH * prior[:, 2])
     prior = np.concatenate([prior[:, :2] * ((1 - cloth) / prior[:, :2].sum(1))[:, None], cloth[:, None]], 1)

@@ -15,6 +15,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 
+from shared.compute.smooth_step import smooth_step
 from shared.geometry.mesh import Mesh, diffused, mesh_edges
 from shared.geometry.raycast import RayScene
 from shared.hair.hair_pixels import HAIR_PIXEL
@@ -107,7 +108,7 @@ def alpha_of(texels: TexelSurface, seen: SeenHair, share: np.ndarray) -> np.ndar
     own = (seen.looks * np.exp(seen.log_hair) + LEAST_SEEN * around) / (seen.looks + LEAST_SEEN)
     own = np.where(around > 0.0, own, 0.0)
     low, high = EDGE
-    return _smooth_step((own - low) / (high - low)).astype(np.float32)
+    return smooth_step((own - low) / (high - low)).astype(np.float32)
 
 
 def at_hairline(grid: ShellGrid, mesh: Mesh, share: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -115,13 +116,7 @@ def at_hairline(grid: ShellGrid, mesh: Mesh, share: np.ndarray, radius: np.ndarr
     thins out, and a shell's edge before it would be a cut. share [V] of hair at the vertices of the grid's mesh; radius
     [R, C] mm of the shell."""
     within = diffused((share > 0.5).astype(float), mesh.faces, HAIRLINE_STEPS)
-    hides = _smooth_step((within - 0.5) / (HAIRLINE_DEEP - 0.5))
+    hides = smooth_step((within - 0.5) / (HAIRLINE_DEEP - 0.5))
     lies = 1.0 - np.clip((radius - grid.base - LIES_MM) / (STANDS_MM - LIES_MM), 0.0, 1.0)
     lies[grid.domed:] = 0.0
     return 1.0 - grid.of_vertices(lies) * (1.0 - hides)
-
-
-def _smooth_step(values: np.ndarray) -> np.ndarray:
-    """0 up to 0, 1 from 1 on, without corners between; values [...]."""
-    step = np.clip(values, 0.0, 1.0)
-    return step * step * (3.0 - 2.0 * step)

@@ -20,7 +20,7 @@ from shared.geometry.mesh import normalised
 from shared.geometry.raycast import camera_hits, pixel_directions
 from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
-from shared.imaging.material_labels import CLOTH, HAIR, LABELS, SKIN, UNKNOWN
+from shared.imaging.material_labels import CLOTH, CLOTH_BELOW_MM, HAIR, LABELS, SKIN, UNKNOWN
 from shared.imaging.views import Views
 
 KINDS = HAIR_PIXEL, SKIN_PIXEL, CLOTH_PIXEL = 0, 1, 2
@@ -30,8 +30,6 @@ UNSEEN, ANY_CLOTH = 2e-6, 0.1
 """Density that no colour falls below, and share of cloth that may have any colour."""
 SURE, MARGIN_PX = 0.8, 4
 """Probability from which on a vertex's material is learnt from, and how far within the mesh's outline."""
-CLOTH_BELOW_MM = 15.0, 45.0
-"""Below the chin: where cloth may begin, and where it is as likely as it gets."""
 ABOVE, BELOW, BETWEEN = (0.98, 0.02, 0.0), (0.43, 0.12, 0.45), (0.05, 0.5, 0.45)
 """Hair, skin and cloth beside the head: above the chin, where cloth is as likely as it gets, and there below the neck.
 """

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from shared.compute.smooth_step import smooth_step
 from shared.imaging.color import encode_srgb
 from shared.imaging.matte import BORDER_PX, blurred, continued, disc, person_matte, unsure_px
 from shared.imaging.picture_detail import edge_width
@@ -100,8 +101,7 @@ def _near(region: np.ndarray, strip: int) -> np.ndarray:
     """[H, W] in [0, 1]: 1 in a region [H, W] bool, 0 a strip's width away from it, without corners between."""
     if not region.any():
         return np.zeros(region.shape)
-    share = 1.0 - np.clip(distance_transform_edt(~region) / strip, 0.0, 1.0)
-    return share * share * (3.0 - 2.0 * share)
+    return smooth_step(1.0 - distance_transform_edt(~region) / strip)
 
 
 def _from_background(person: np.ndarray, strip: int) -> np.ndarray:

@@ -61,6 +61,14 @@ class NeededSamples:
     over_frames: HalfSpread
     over_points: HalfSpread
 
+    @property
+    def told(self) -> str:
+        """What is enough, and why, for the log."""
+        enough = f"{self.frames} frames, {self.sizes.points} points, {self.sizes.directions} directions"
+        apart = [f"{half.count} {name} {100.0 * half.difference:.1f} %"
+                 for half, name in ((self.over_frames, "frames"), (self.over_points, "points"))]
+        return f"{enough} are enough: lights of halves lie apart, with {' and '.join(apart)}"
+
 
 def enough_samples(
     capture: Capture, settings: AppearanceSettings, solution: Solution, frames: int, sizes: Sizes

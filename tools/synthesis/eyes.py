@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from shared.compute.smooth_step import smooth_step
 from shared.geometry.eyeballs import EYE_RADIUS_MM, SIDES, fit_sphere
 from shared.geometry.raycast import RayScene
 from shared.tracking.head_model import HeadModel
@@ -166,8 +167,7 @@ def _rounded(vertices: np.ndarray, oval: list[_Oval], centres: np.ndarray, radiu
         length = np.linalg.norm(arm[near], axis=1)
         outward = arm[near] / length[:, None]
         surface = old.distance(outward)
-        part = np.clip((length - surface - KEPT_MM) / (FREE_MM - KEPT_MM), 0.0, 1.0)
-        weight = 1.0 - part * part * (3.0 - 2.0 * part)
+        weight = 1.0 - smooth_step((length - surface - KEPT_MM) / (FREE_MM - KEPT_MM))
         moved[near] += weight[:, None] * (centre - old.centre + (radius - surface)[:, None] * outward)
         own = vertices[old.vertices] - old.centre
         moved[old.vertices] = centre + radius * own / np.linalg.norm(own, axis=1, keepdims=True)

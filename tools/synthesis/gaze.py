@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shared.compute.smooth_step import smooth_step
 from shared.geometry.eyeballs import gaze_towards
 from shared.geometry.transforms import camera_centres
 from tools.synthesis.eyes import LivingEyes
@@ -97,8 +98,7 @@ def _jump(gaze: np.ndarray, frame: int, end: int, fps: float) -> None:
     size = np.degrees(np.abs(gaze[frame] - start).max())
     frames = (SACCADE_S + SACCADE_S_PER_DEG * size) * fps
     for i in range(frame, end):
-        part = min(1.0, (i - frame + 1) / max(frames, 1.0))
-        gaze[i] = start + part * part * (3.0 - 2.0 * part) * (gaze[i] - start)
+        gaze[i] = start + smooth_step((i - frame + 1) / max(frames, 1.0)) * (gaze[i] - start)
 
 
 def blink_curve(frames: int, fps: float, per_second: float, rng: np.random.Generator) -> np.ndarray:
@@ -109,11 +109,7 @@ def blink_curve(frames: int, fps: float, per_second: float, rng: np.random.Gener
     lasts = CLOSING_S + SHUT_S + OPENING_S
     for number in range(count):
         start = part * number + rng.uniform(0.0, max(part - lasts, 0.0))
-        closing = np.clip((time - start) / CLOSING_S, 0.0, 1.0)
-        opening = np.clip((time - start - CLOSING_S - SHUT_S) / OPENING_S, 0.0, 1.0)
-        shut = np.maximum(shut, _eased(closing) * (1.0 - _eased(opening)))
+        closing = smooth_step((time - start) / CLOSING_S)
+        opening = smooth_step((time - start - CLOSING_S - SHUT_S) / OPENING_S)
+        shut = np.maximum(shut, closing * (1.0 - opening))
     return shut
-
-
-def _eased(part: np.ndarray) -> np.ndarray:
-    return part * part * (3.0 - 2.0 * part)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, maximum_filter
 
+from shared.compute.smooth_step import smooth_step
 from shared.geometry.mesh import Mesh
 from shared.geometry.raycast import RayScene
 from shared.imaging.material_labels import CLOTH, HAIR
@@ -91,8 +92,8 @@ def _hair_shell(scene: RayScene, haircut: str, seed: int) -> np.ndarray:
     profile = np.concatenate([upper, _curtain(scene, azimuth, upper[-1], down, SHELL_MM[haircut])])
     ragged = gaussian_filter1d(rng.normal(size=COLUMNS), 1.2, mode="wrap") * 2.0
     hem = len(polar) + (upper[-1, :, 1].mean() - HEM_Y_MM[haircut] + RAGGED_MM * np.clip(ragged, -1, 1)) / STEP_MM - 1
-    turn = np.clip((off_front - CURTAIN_DEG[0]) / (CURTAIN_DEG[1] - CURTAIN_DEG[0]), 0.0, 1.0)
-    last = ends / STEP_DEG + (hem - ends / STEP_DEG) * turn**2 * (3 - 2 * turn)
+    turn = smooth_step((off_front - CURTAIN_DEG[0]) / (CURTAIN_DEG[1] - CURTAIN_DEG[0]))
+    last = ends / STEP_DEG + (hem - ends / STEP_DEG) * turn
     outer = _along_columns(profile, np.linspace(0.0, 1.0, ROWS)[:, None] * np.minimum(last, len(profile) - 1.001))
     strands = gaussian_filter(rng.normal(size=(ROWS, COLUMNS)), (9.0, 0.8), mode=("nearest", "wrap"))
     lift = np.clip(np.arange(ROWS) / 12.0, 0.0, 1.0)[:, None, None]

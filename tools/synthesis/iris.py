@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from shared.compute.smooth_step import smooth_step
 from shared.geometry.eyeballs import gaze_rotation
 from shared.geometry.mesh import normalised
 from shared.imaging.texture import sample_bilinear
@@ -85,8 +86,8 @@ class EyePaint:
     @staticmethod
     def _cornea_share(place: np.ndarray) -> np.ndarray:
         """[N] of points [N, 3] mm in the eyeball's space: 1 within the iris' rim, 0 outside and behind."""
-        part = np.clip((IRIS_RADIUS_MM - np.hypot(place[:, 0], place[:, 1])) / LIMBUS_MM + 0.5, 0.0, 1.0)
-        return np.where(place[:, 2] > 0, part * part * (3.0 - 2.0 * part), 0.0)
+        share = smooth_step((IRIS_RADIUS_MM - np.hypot(place[:, 0], place[:, 1])) / LIMBUS_MM + 0.5)
+        return np.where(place[:, 2] > 0, share, 0.0)
 
     def _wet_surface(self, place: np.ndarray, outward: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where rays [N, 3] that arrive at points [N, 3] mm of the eyeball pass its wet surface, and normals there."""
@@ -142,7 +143,7 @@ def _iris(off_axis: np.ndarray, around: np.ndarray, pupil: float, colour: np.nda
     fibres = sum(amount * value_noise(spread, wavelength, rng)
                  for wavelength, amount in ((1.6, 0.22), (0.8, 0.22), (0.45, 0.16)))
     inner = np.exp(-((across - pupil - 0.7) / 0.7) ** 2)
-    rim = np.clip((across - 4.7) / 0.9, 0.0, 1.0)
-    level = np.clip(1.0 + fibres, 0.3, 2.0) * (1.0 + 0.45 * inner) * (1.0 - 0.75 * rim * rim * (3.0 - 2.0 * rim))
+    rim = smooth_step((across - 4.7) / 0.9)
+    level = np.clip(1.0 + fibres, 0.3, 2.0) * (1.0 + 0.45 * inner) * (1.0 - 0.75 * rim)
     warm = colour + inner[..., None] * 0.4 * (np.array(IRIS_COLOURS[3]) - colour)
     return level[..., None] * warm

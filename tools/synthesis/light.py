@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from shared.compute.smooth_step import smooth_step
 from shared.rendering.envmap import latlong_directions, latlong_lookup
 
 LAMP_THRESHOLD = 3.0
@@ -259,5 +260,4 @@ def _disc(directions: np.ndarray, azimuth_deg: float, elevation_deg: float, radi
 
 
 def _ramp(inside_deg: np.ndarray) -> np.ndarray:
-    part = np.clip(inside_deg / 3.0 + 0.5, 0.0, 1.0)
-    return part * part * (3.0 - 2.0 * part)
+    return smooth_step(inside_deg / 3.0 + 0.5)

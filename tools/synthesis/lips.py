@@ -13,6 +13,7 @@ import scipy.sparse as sparse
 from scipy.ndimage import gaussian_filter1d
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from shared.compute.smooth_step import smooth_step
 from shared.geometry.mesh import half_edges
 from shared.geometry.raycast import RayScene
 from tools.synthesis.head import Head
@@ -74,8 +75,7 @@ def _mouth(head: Head) -> _Mouth:
     length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
     graph = sparse.coo_matrix((length, pairs.T), shape=(len(vertices),) * 2).tocsr()
     below, above = (dijkstra(graph, indices=arc, min_only=True, limit=REACH_MM) for arc in (lower, upper))
-    part = 1.0 - np.minimum(np.minimum(below, above) / REACH_MM, 1.0)
-    weight = part * part * (3.0 - 2.0 * part)
+    weight = smooth_step(1.0 - np.minimum(below, above) / REACH_MM)
     upwards = np.clip((np.minimum(above, REACH_MM) - np.minimum(below, REACH_MM)) / CORNER_MM, -0.5, 0.5)
     return _Mouth(middle, half_width, upwards * weight)
 
