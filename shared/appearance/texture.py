@@ -65,6 +65,8 @@ about what is there, a fold or a mole, and their mean is a better guess of it th
 held-out frames, for 0.15 dB of albedo under a hard lamp)."""
 
 LEAST_ALBEDO = 0.002
+LEAST_KNOWN = 0.1
+"""Information on a texel's log albedo from which on it is rather known than not."""
 
 PRODUCTS = 7
 """That the normal equations sum up per channel."""
@@ -109,6 +111,11 @@ def _radiance(albedo, specular, rows, irradiance, reflection, sent):
     for i in range(len(rows)):
         for c in range(3):
             sent[i, c] = albedo[rows[i], c] * irradiance[i, c] + specular[rows[i]] * reflection[i, c]
+
+
+def known_share(information: np.ndarray) -> np.ndarray:
+    """[T] in 0 .. 1: how far texels are known, by their information on the log albedo [T]."""
+    return information / (information + LEAST_KNOWN)
 
 
 class NormalEquations:

@@ -25,6 +25,7 @@ from shared.appearance.texture import (
     NormalEquations,
     ScatterSums,
     TexelMaterial,
+    known_share,
     pooled_specular,
     robust_weight,
     weigh_lights,
@@ -33,6 +34,7 @@ from shared.compute.read_ahead import work_ahead
 from shared.compute.run_context import SILENT, RunContext
 from shared.compute.threads import share_out
 from shared.geometry.eyeballs import IRIS_MM
+from shared.geometry.mesh import Mesh, diffused, typical_edge
 from shared.geometry.transforms import camera_centres
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer, is_inactive
@@ -60,8 +62,8 @@ HIDING_SPREAD, LEAST_SEEN = 1.0, 0.001
 probability that nothing does."""
 SEAM_STEPS = 8
 """Edges over which what no frame shows turns from what it lies beside to what its surroundings suggest."""
-LEAST_KNOWN = 0.1
-"""Information on a texel's log albedo from which on it is rather known than not."""
+BORDER_MM = 6.0
+"""Over which it turns from hair to skin."""
 HELD_AT_SEAM = 100.0
 """How much more vertices that frames show count there than one edge between two."""
 FIRST_PASS_FRAMES = 32
@@ -287,13 +289,16 @@ class TexturePass:
         """The material with what no frame shows going on from what lies beside it, where the log albedo around it [V,
         3] is another: by the membrane that the differences on both sides of the seam span, which sinks to nothing.
         told [T]: information on the log albedo, of the channel that is known best."""
-        known = told / (told + LEAST_KNOWN)
+        known = known_share(told)
         if self.eyes is not None:
             known[self.eyes.rows] = 0.0
         apart = np.log(np.maximum(material.albedo, LEAST_ALBEDO)) - self.surface.interpolate(around)
         means, weight = self.surface.to_vertices(apart, np.repeat(known[:, None], 3, axis=1))
         membrane = SmoothFields(self.surface.mesh, 1.0, SEAM_STEPS, self.region)
-        step = self.surface.interpolate(membrane.through(means, HELD_AT_SEAM * weight, np.zeros(3)))
+        step = membrane.through(means, HELD_AT_SEAM * weight, np.zeros(3))
+        if self.region is not None:
+            step = _across_border(around + step, self.region, self.surface.mesh) - around
+        step = self.surface.interpolate(step)
         filled = np.clip(material.albedo * np.exp((1.0 - known[:, None]) * step), LEAST_ALBEDO, 1.0)
         if self.eyes is not None:
             filled[self.eyes.rows] = material.albedo[self.eyes.rows]
@@ -360,6 +365,15 @@ class TexturePass:
         for view in work_ahead(self.view, frames):
             sums += sum(self._share_out(view, lambda lit: _squared_errors(candidates, lit, self.seen)))
         return [float(value) for value in np.sqrt(sums[1:] / max(3.0 * sums[0], 1e-9))]
+
+
+def _across_border(field: np.ndarray, region: np.ndarray, mesh: Mesh) -> np.ndarray:
+    """A field [V, C] that ends at the border of a region [V] bool, turning over from one side's values to the
+    other's."""
+    steps = round((BORDER_MM / typical_edge(mesh.vertices, mesh.faces)) ** 2)
+    share = diffused(region[:, None].astype(float), mesh.faces, steps)
+    near = 4.0 * share * (1.0 - share)
+    return field + near * (diffused(field, mesh.faces, steps) - field)
 
 
 def _squared_errors(candidates: list[TexelMaterial], lit: LitSamples, seen: np.ndarray | None) -> np.ndarray:

@@ -163,6 +163,11 @@ def diffused(values: np.ndarray, faces: np.ndarray, steps: int) -> np.ndarray:
     return values
 
 
+def typical_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Median length of the faces' first edges, mm."""
+    return float(np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)))
+
+
 def unique_pairs(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """[N, 2] indices -> distinct pairs [U, 2] in order, which of them each is [N], how often each occurs [U]."""
     count = int(pairs.max(initial=0)) + 1

@@ -28,6 +28,8 @@ REFERENCES = {
     "Bradski2000": "Bradski, The OpenCV Library. Dr. Dobb's Journal of Software Tools, 2000.",
     "Breiman1984": "Breiman et al., Classification and Regression Trees. Wadsworth, 1984.",
     "Burley2012": "Burley, Physically-Based Shading at Disney. SIGGRAPH courses, 2012.",
+    "Burt1983":
+        "Burt, Adelson, The Laplacian Pyramid as a Compact Image Code. IEEE Transactions on Communications 31, 1983.",
     "Carpenter1988": "Carpenter, Movements of the Eyes. Pion, 1988.",
     "Catmull1978":
         "Catmull, Clark, Recursively generated B-spline surfaces on arbitrary topological meshes. Computer-Aided "

@@ -19,7 +19,7 @@ from shared.appearance.observations import face_front
 from shared.appearance.problem import AppearanceSettings
 from shared.compute.run_context import SILENT, RunContext
 from shared.compute.threads import share_out
-from shared.geometry.mesh import Mesh, subdivide, vertex_normals
+from shared.geometry.mesh import Mesh, subdivide, typical_edge, vertex_normals
 from shared.geometry.surface import TrackPoints
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.views import Views
@@ -306,11 +306,6 @@ class ShapeSolver:
             elif (worse := worse + 1) > MOST_WORSE:
                 break
         return best.mesh
-
-
-def typical_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Median length of the faces' first edges, mm."""
-    return float(np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)))
 
 
 def _residuals(surface: ShapedSurface) -> str:

@@ -168,6 +168,21 @@ def test_what_no_frame_shows_goes_on_from_what_lies_beside_it(monkeypatch):
     assert far[0] < 0.01 < far[2] < 0.1 < far[8]
 
 
+def test_unseen_hair_turns_into_unseen_skin_over_some_millimetres(monkeypatch):
+    """The border of a region where no frame looks: beyond it the fill is that region's mean."""
+    monkeypatch.setattr(texture_pass, "SURROUNDINGS_SPREAD", 0.02)
+    monkeypatch.setattr(texture_pass, "SEAM_STEPS", 0.5)
+    steps, seen = {}, {}
+    for width in (texture_pass.BORDER_MM, 0.0):
+        monkeypatch.setattr(texture_pass, "BORDER_MM", width)
+        surface, material, *_ = run_pass(region_from=0.9)
+        image = surface.to_image(np.log(material.albedo))
+        steps[width] = np.abs(np.diff(image, axis=1))[8:-8, int(0.85 * MAP) : int(0.95 * MAP)].max()
+        seen[width] = image[:, : int(0.6 * MAP)]
+    assert steps[6.0] < 0.5 * steps[0.0]
+    assert np.allclose(seen[6.0], seen[0.0], atol=1e-5)
+
+
 def test_what_hangs_before_a_place_says_nothing_of_it():
     """Dark hair, before a third of the plate."""
     mesh = grid_plane(33, 80.0)

@@ -9,9 +9,9 @@ import numpy as np
 
 from shared.geometry.mesh import Mesh, interpolate, vertex_normals
 from shared.geometry.transforms import rigid, rotation_from_vector
+from shared.imaging.value_noise import value_noise
 from shared.tracking.head_model import HeadModel
 from tools.synthesis.bust import with_bust
-from tools.synthesis.noise import value_noise
 
 IDENTITY_DEVIATION = 0.8
 BUMPS_MM = ((9.0, 0.10), (4.0, 0.05))

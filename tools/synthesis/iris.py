@@ -15,9 +15,9 @@ from shared.compute.smooth_step import smooth_step
 from shared.geometry.eyeballs import gaze_rotation
 from shared.geometry.mesh import normalised
 from shared.imaging.texture import sample_bilinear
+from shared.imaging.value_noise import value_noise
 from shared.rendering import brdf
 from tools.synthesis.eyes import LivingEyes
-from tools.synthesis.noise import value_noise
 from tools.synthesis.surface import Materials
 
 IRIS_RADIUS_MM = 5.85

@@ -16,8 +16,8 @@ from scipy.ndimage import distance_transform_edt
 from shared.capture.landmarks import BROW_LEFT, BROW_RIGHT
 from shared.geometry.mesh import interpolate, normalised, rasterize_uv
 from shared.imaging.material_labels import BROW, CLOTH, EYE, HAIR, LIPS, SKIN, UNKNOWN
+from shared.imaging.value_noise import value_noise
 from tools.synthesis.head import Head
-from tools.synthesis.noise import value_noise
 from tools.synthesis.surface import Materials
 
 BARE_SKIN = np.array([0.86, 0.75, 0.66])

@@ -13,9 +13,9 @@ import numpy as np
 
 from shared.geometry.mesh import Mesh, normalised, vertex_adjacency, vertex_normals
 from shared.geometry.raycast import RayScene
+from shared.imaging.value_noise import value_noise
 from tools.synthesis.bust import quads
 from tools.synthesis.head import Head
-from tools.synthesis.noise import value_noise
 from tools.synthesis.surface import Materials
 
 GLASSES_U, HAIR_U = (0.006, 0.034), (0.966, 0.994)
