@@ -63,8 +63,8 @@ def with_grain(
 
 
 def octaves(surface: TexelSurface, logs: np.ndarray, trusted: np.ndarray) -> list[Grain]:
-    """What log albedo [T, 3] has of grain among the trusted texels [T] bool, from the finest octave on: the levels of a
-    Laplacian pyramid ([Burt1983]) of them alone."""
+    """What the log albedo, logs [T, 3], has of grain among the trusted texels [T] bool, from the finest octave on: the
+    levels of a Laplacian pyramid ([Burt1983]) of them alone."""
     weight = trusted.astype(np.float32)
     level = surface.to_image(np.concatenate([logs * weight[:, None], weight[:, None]], axis=1).astype(np.float32))
     found, wavelength = [], FINEST_TEXELS * surface.typical_texel_mm()

@@ -19,7 +19,7 @@ def value_noise(places_mm: np.ndarray, wavelength_mm: float, rng: np.random.Gene
 
 
 def octave_noise(places_mm: np.ndarray, wavelength_mm: float, rng: np.random.Generator) -> np.ndarray:
-    """The same without most of what is more than an octave slower."""
+    """[..., 3] mm -> [...] the same without most of what is more than an octave slower."""
     nodes = rng.normal(size=(NOISE_PERIOD,) * 3)
     return _splines(nodes - gaussian_filter(nodes, 1.0, mode="wrap"), places_mm, wavelength_mm) / OCTAVE_DEVIATION
 
