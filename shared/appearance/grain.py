@@ -57,8 +57,7 @@ def with_grain(
         for octave in octaves(surface, logs, trusted):
             drawn = octave_noise(places, octave.wavelength_mm, rng)
             grain[rows] += (share[rows] * (1.0 - known[rows]) * drawn)[:, None] * octave.deviation
-    albedo = np.clip(material.albedo * np.exp(grain), np.minimum(material.albedo, LEAST_ALBEDO),
-                     np.maximum(material.albedo, 1.0))
+    albedo = np.clip(material.albedo * np.exp(grain), LEAST_ALBEDO, 1.0)
     return replace(material, albedo=albedo.astype(np.float32))
 
 

@@ -34,7 +34,7 @@ from shared.compute.read_ahead import work_ahead
 from shared.compute.run_context import SILENT, RunContext
 from shared.compute.threads import share_out
 from shared.geometry.eyeballs import IRIS_MM
-from shared.geometry.mesh import Mesh, diffused, typical_edge
+from shared.geometry.mesh import Mesh, diffused_over
 from shared.geometry.transforms import camera_centres
 from shared.imaging.frame_index import spread_frames
 from shared.imaging.image_sampling import SurfaceViewer, is_inactive
@@ -370,10 +370,9 @@ class TexturePass:
 def _across_border(field: np.ndarray, region: np.ndarray, mesh: Mesh) -> np.ndarray:
     """A field [V, C] that ends at the border of a region [V] bool, turning over from one side's values to the
     other's."""
-    steps = round((BORDER_MM / typical_edge(mesh.vertices, mesh.faces)) ** 2)
-    share = diffused(region[:, None].astype(float), mesh.faces, steps)
-    near = 4.0 * share * (1.0 - share)
-    return field + near * (diffused(field, mesh.faces, steps) - field)
+    spread = diffused_over(mesh, np.concatenate([region[:, None], field], axis=1), BORDER_MM)
+    share, smooth = spread[:, :1], spread[:, 1:]
+    return field + 4.0 * share * (1.0 - share) * (smooth - field)
 
 
 def _squared_errors(candidates: list[TexelMaterial], lit: LitSamples, seen: np.ndarray | None) -> np.ndarray:

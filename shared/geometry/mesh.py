@@ -168,6 +168,12 @@ def typical_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)))
 
 
+def diffused_over(mesh: Mesh, values: np.ndarray, width_mm: float) -> np.ndarray:
+    """The vertices' values [V, ...] spread over some width, mm, whatever the mesh's edges are."""
+    steps = round((width_mm / typical_edge(mesh.vertices, mesh.faces)) ** 2)
+    return diffused(values, mesh.faces, steps)
+
+
 def unique_pairs(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """[N, 2] indices -> distinct pairs [U, 2] in order, which of them each is [N], how often each occurs [U]."""
     count = int(pairs.max(initial=0)) + 1

@@ -11,7 +11,7 @@ from shared.appearance.grain import with_grain
 from shared.appearance.maps import make_maps
 from shared.appearance.texture_pass import TexturePass
 from shared.compute.run_context import RunContext
-from shared.geometry.mesh import diffused, typical_edge
+from shared.geometry.mesh import diffused_over
 from shared.geometry.surface import Surface
 from shared.imaging.image_sampling import SurfaceViewer
 from shared.imaging.material_labels import SKIN
@@ -110,6 +110,4 @@ def scalp_of(surface: Surface) -> np.ndarray | None:
     None where the mesh has no segments."""
     if surface.face_segment is None:
         return None
-    faces = surface.mesh.faces
-    steps = round((HAIRLINE_MM / typical_edge(surface.mesh.vertices, faces)) ** 2)
-    return diffused(surface.vertices_of(("scalp",)).astype(float), faces, steps) > 0.5
+    return diffused_over(surface.mesh, surface.vertices_of(("scalp",)).astype(float), HAIRLINE_MM) > 0.5

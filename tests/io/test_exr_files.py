@@ -26,9 +26,9 @@ LEVELS = {"scanline": 1, "tiled": 1, "mipmap": 8}
 def test_layouts_hold_the_same_pixels(tmp_path, layout, half):
     """Level 0 is exact, each further level the box mean of the one before; the bytes do not depend on the time."""
     values = np.random.default_rng(8).uniform(0.0, 2.0, (128, 128, 3)).astype(np.float16 if half else np.float32)
-    options = {"colour_space": "lin_ap1_scene", "half": half, "layout": layout, "attributes": {"unit": "u"}}
     for name in ("a.exr", "b.exr"):
-        write_exr(tmp_path / name, values, **options)
+        write_exr(tmp_path / name, values, colour_space="lin_ap1_scene", half=half, layout=layout,
+                  attributes={"unit": "u"})
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
     np.testing.assert_array_equal(read_exr(tmp_path / "a.exr"), values.astype(np.float32))
     with OpenEXR.File(str(tmp_path / "a.exr")) as file:
