@@ -12,7 +12,7 @@ distribution over logarithms, and the whites of the eyes (eye_whites) and a char
 A fourth only keeps the skin's brightest places from returning more than the lightest reference skin.
 
 With u [3] the log of the mean irradiance on the skin and y [3] the log of the mean radiance that it returns, albedo is
-exp(y - u) and all of it is one quadratic in u, but for the fourth.
+exp(y - u) and all of it is one quadratic in u, but for the fourth and for highlights: what is taken is the mean.
 
 References: skin I to VI of the Physically Based database (physicallybased.info, CC0), the same that OpenPBR viewers
 offer; ColorChecker patches "light skin" and "dark skin" (sRGB values of X-Rite, November 2014).
@@ -20,12 +20,15 @@ offer; ColorChecker patches "light skin" and "dark skin" (sRGB values of X-Rite,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.stats import norm
+from scipy.stats.qmc import Sobol
 
 from shared.appearance.light_tint import LightTint
 from shared.imaging.color import LUMINANCE
@@ -51,6 +54,8 @@ BRIGHTEST, BRIGHTEST_SIGMA = 0.95, 0.05
 """The quantile of the skin's albedo that no reference skin's exceeds, and by how much, in the logarithm, it may."""
 HIGHLIGHT_SIGMA = 0.08
 """Relative standard deviation of a specular intensity that the clip shows."""
+POINTS, PROPOSAL_WIDTH = 2048, 1.5
+"""Of the importance sampling, and by how much it reaches farther than the normal distribution of the same curvature."""
 NINE_OF_TEN = 1.645
 """Standard deviations to both sides of a normal distribution's mean that hold nine tenths of it."""
 MODEL_ERROR = 0.003
@@ -173,7 +178,7 @@ def resolve_scale(
     whites: tuple[np.ndarray, np.ndarray] | None = None,
     tints: Sequence[LightTint | None] = (),
 ) -> ResolvedScale:
-    """The factor on the light per channel and the specular intensity that are jointly most likely.
+    """The factor on the light per channel and the specular intensity that all statements together expect.
 
     The lobe returns the light's own colour and its strength has a known range, so highlights say something about the
     scale that diffuse skin cannot: with the light multiplied by k, channel c wants s k_c = t_c. log_albedo,
@@ -183,7 +188,7 @@ def resolve_scale(
     not asked; whites: as chart, of the whites of the eyes.
     With a chart the highlights give s alone: on the scale their range has little to add, and the model's errors pass
     for highlights.
-    -> log k [3], and s, the prior's mean without highlights; covariances are Laplace's approximation.
+    -> the mean of log k [3] and its covariance, see mean_of_density, and s, the prior's mean without highlights.
     """
     log_radiance = log_albedo + log_irradiance
     matrix, right = scale_prior(log_radiance, white_sigma, relative_light=relative_light)
@@ -193,38 +198,68 @@ def resolve_scale(
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
         matrix = np.concatenate([matrix, whitening])
         right = np.concatenate([right, whitening @ (log_irradiance + wanted)])
+    right = right - matrix @ log_irradiance
     mean, sigma = specular_prior
-    alone = np.linalg.lstsq(matrix, right - matrix @ log_irradiance, rcond=None)[0]
-    ceiling = np.log(REFERENCE_SKINS.max())
+    alone = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    spread = None if highlights is None else _highlight_spread(highlights, mean)
 
-    def on_skin(log_factor: np.ndarray) -> np.ndarray:
-        unlikely = matrix @ (log_irradiance + log_factor) - right
-        if log_brightest is None or chart is not None:
-            return unlikely
-        return np.append(unlikely, np.maximum(log_brightest - log_factor - ceiling, 0.0) / BRIGHTEST_SIGMA)
-
-    def resolved(log_factor: np.ndarray, specular: float, jacobian: np.ndarray) -> ResolvedScale:
-        covariance = np.linalg.inv(jacobian.T @ jacobian)[:3, :3]
-        return ResolvedScale(log_factor, specular, covariance, prior_covariance)
-
-    if highlights is None:
-        solved = least_squares(on_skin, alone, method="lm")
-        return resolved(solved.x, mean, solved.jac)
-    spread = _highlight_spread(highlights, mean)
-
-    def on_highlights(log_factor: np.ndarray, log_intensity: float) -> np.ndarray:
+    def on_highlights(log_factor: np.ndarray, log_intensity: np.ndarray) -> np.ndarray:
         amplitude = (np.exp(log_intensity + log_factor) - highlights.intensity) / spread
         robust = np.sign(amplitude) * np.sqrt(2.0 * (np.sqrt(1.0 + amplitude**2) - 1.0))
-        return np.append(robust, (log_intensity - np.log(mean)) / sigma)
-
-    def jointly(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([on_skin(x[:3]), on_highlights(x[:3], x[3])])
+        return np.concatenate([robust, (log_intensity - np.log(mean)) / sigma], axis=-1)
 
     if chart is not None:
-        solved = least_squares(lambda x: on_highlights(alone, x[0]), [np.log(mean)], method="lm").x
-        return resolved(alone, float(np.exp(solved[0])), matrix)
-    solved = least_squares(jointly, np.append(alone, np.log(mean)), method="lm")
-    return resolved(solved.x[:3], float(np.exp(solved.x[3])), solved.jac)
+        specular = mean
+        if highlights is not None:
+            solved = least_squares(lambda x: on_highlights(alone, x), [np.log(mean)], method="lm")
+            specular = float(np.exp(solved.x[0]))
+        return ResolvedScale(alone, specular, np.linalg.inv(matrix.T @ matrix), prior_covariance)
+
+    def stated(x: np.ndarray) -> np.ndarray:
+        on_skin = x[..., :3] @ matrix.T - right
+        if highlights is None:
+            return on_skin
+        return np.concatenate([on_skin, on_highlights(x[..., :3], x[..., 3:])], axis=-1)
+
+    def too_bright(x: np.ndarray) -> np.ndarray:
+        if log_brightest is None:
+            return np.zeros((*x.shape[:-1], 3))
+        return np.maximum(log_brightest - x[..., :3] - np.log(REFERENCE_SKINS.max()), 0.0) / BRIGHTEST_SIGMA
+
+    start = alone if highlights is None else np.append(alone, np.log(mean))
+    likeliest, covariance = mean_of_density(stated, too_bright, start)
+    specular = mean if highlights is None else float(np.exp(likeliest[3]))
+    return ResolvedScale(likeliest[:3], specular, covariance[:3, :3], prior_covariance)
+
+
+def mean_of_density(
+    stated: Callable[[np.ndarray], np.ndarray], bounding: Callable[[np.ndarray], np.ndarray], start: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean [n] and covariance [n, n] of the density exp(-(|stated(x)|^2 + |bounding(x)|^2) / 2), n up to 4.
+
+    stated, bounding: residuals [..., m] of x [..., n]; the latter are 0 but beyond a bound. start [n]: where the search
+    for the mode begins. Where a bound cuts the density, its mode lies on the bound and the curvature there is the
+    bound's own, while most of the density lies within: so neither mode nor Laplace's approximation will do. Importance
+    sampling about the mode [Geweke1989], with pairs of opposite points, by which the mean of a normal density is exact.
+    """
+    mode = least_squares(lambda x: np.concatenate([stated(x), bounding(x)]), start, method="lm").x
+    jacobian = least_squares(stated, mode, method="lm", max_nfev=1).jac
+    unbounded = np.linalg.inv(jacobian.T @ jacobian)
+    normal = _opposite_points(len(mode))
+    x = mode + PROPOSAL_WIDTH * normal @ np.linalg.cholesky(unbounded).T
+    log_density = -0.5 * (np.square(stated(x)).sum(1) + np.square(bounding(x)).sum(1))
+    log_weight = log_density + 0.5 * np.square(normal).sum(1)
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    mean = weight @ x
+    return mean, (weight[:, None] * (x - mean)).T @ (x - mean)
+
+
+@cache
+def _opposite_points(dimensions: int) -> np.ndarray:
+    """[2 POINTS, dimensions]: points of a normal distribution, the same each time, each with its opposite."""
+    points = norm.ppf(Sobol(dimensions, rng=np.random.default_rng(0)).random(POINTS))
+    return np.concatenate([points, -points])
 
 
 def _highlight_spread(highlights: Highlights, mean_intensity: float) -> np.ndarray:

@@ -59,6 +59,8 @@ REFERENCES = {
     "Geman1985":
         "Geman, McClure, Bayesian Image Analysis: An Application to Single Photon Emission Tomography. American "
         "Statistical Association, 1985.",
+    "Geweke1989":
+        "Geweke, Bayesian Inference in Econometric Models Using Monte Carlo Integration. Econometrica 57 (6), 1989.",
     "Golub1973":
         "Golub, Pereyra, The Differentiation of Pseudo-Inverses and Nonlinear Least Squares Problems Whose Variables "
         "Separate. SIAM Journal on Numerical Analysis 10, 1973.",

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from field_check import below, field_faults
+from scipy.stats import norm
 
 from shared.appearance.albedo_scale import (
     HIGHLIGHT_SIGMA,
@@ -10,6 +11,7 @@ from shared.appearance.albedo_scale import (
     REFERENCE_SKINS,
     Highlights,
     fit_skin_locus,
+    mean_of_density,
     most_likely_irradiance,
     resolve_scale,
 )
@@ -173,10 +175,10 @@ def test_highlights_tell_a_bright_light_from_bright_skin():
     """All statements agree on the factor 1/2: light twice too bright, so highlights look half as strong."""
     skin, mean = on_the_locus(), (0.7, 0.35)
     light = np.full(3, np.log(2.0))
-    found = Highlights(np.full(3, 0.35), np.full(3, 100.0), np.ones(3))
+    found = Highlights(np.full(3, 0.35), np.full(3, 1e6), np.ones(3))
     log_factor, specular, *_ = resolve_scale(skin - light, light, found, mean)
-    assert np.allclose(log_factor, -np.log(2.0), atol=1e-6)
-    assert specular == pytest.approx(0.7, rel=1e-6)
+    assert np.allclose(log_factor, -np.log(2.0), atol=0.03), "highlights are log-normal only nearly"
+    assert specular == pytest.approx(0.7, rel=0.01)
     without, specular, *_ = resolve_scale(skin - light, light, None, mean)
     assert np.allclose(without, -np.log(2.0), atol=1e-6) and specular == 0.7
     stronger = Highlights(np.full(3, 0.7), np.full(3, 100.0), np.ones(3))
@@ -194,16 +196,19 @@ def test_highlights_that_are_not_there_say_little():
 def test_what_is_known_of_the_scale_adds_up_as_precisions():
     skin, prior = on_the_locus(), (0.7, 0.35)
     alone = resolve_scale(skin, np.zeros(3), None, prior)
-    np.testing.assert_allclose(alone.covariance, alone.prior_covariance, rtol=1e-4)
+    np.testing.assert_allclose(alone.covariance, alone.prior_covariance, rtol=1e-3)
     said = np.diag([0.02, 0.03, 0.05]) ** 2
     both = resolve_scale(skin, np.zeros(3), None, prior, chart=(np.zeros(3), said))
-    np.testing.assert_allclose(both.covariance, np.linalg.inv(np.linalg.inv(alone.covariance) + np.linalg.inv(said)))
+    np.testing.assert_allclose(
+        both.covariance, np.linalg.inv(np.linalg.inv(alone.prior_covariance) + np.linalg.inv(said))
+    )
     shine = resolve_scale(skin, np.zeros(3), Highlights(np.full(3, 0.7), np.full(3, 1e6), np.ones(3)), prior)
     jointly = np.zeros((4, 4))  # of the three factors and of the intensity, which highlights show the product of
     jointly[:3, :3], jointly[3, 3] = np.linalg.inv(alone.covariance), prior[1] ** -2
     for channel in np.eye(4)[:3] + np.eye(4)[3]:
         jointly += np.outer(channel, channel) / (HIGHLIGHT_SIGMA**2 + MODEL_ERROR**2)
-    np.testing.assert_allclose(shine.covariance, np.linalg.inv(jointly)[:3, :3], rtol=0.01)
+    share = shine.covariance / np.linalg.inv(jointly)[:3, :3]
+    assert (share > 1.0).all() and (share < 1.1).all(), "tails of highlights are heavier than a normal density's"
 
 
 def test_the_record_of_the_scale_states_its_interval():
@@ -213,7 +218,7 @@ def test_the_record_of_the_scale_states_its_interval():
     low, high = np.array(record["skin_albedo_90"])
     np.testing.assert_allclose(low * high, skin**2, rtol=1e-3)
     np.testing.assert_allclose(np.log(high / low) / 2, 1.645 * np.sqrt(np.diag(alone.covariance)), rtol=1e-3)
-    assert record["prior_share"] == pytest.approx(1.0, rel=1e-4)
+    assert record["prior_share"] == pytest.approx(1.0, rel=1e-3)
     share = LUMINANCE * skin / (LUMINANCE @ skin)
     assert record["log_sigma"]["luminance"] ** 2 == pytest.approx(share @ alone.covariance @ share, rel=1e-3)
     assert field_faults(describe_scale(None, skin, scale=alone), below(SOLVE, "albedo_scale")) == []
@@ -227,9 +232,44 @@ def test_no_skin_returns_more_than_the_lightest():
     held, *_ = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25), log_brightest=skin + 0.15)
     assert np.exp(skin + 0.15 - free).max() > 1.0
     assert np.exp(skin + 0.15 - held).max() < 0.95
-    dark = on_the_locus()
-    unhindered, *_ = resolve_scale(dark, np.zeros(3), None, (0.7, 0.25), log_brightest=dark + 0.15)
-    assert np.allclose(unhindered, resolve_scale(dark, np.zeros(3), None, (0.7, 0.25))[0], atol=1e-6)
+    dark, known = on_the_locus(), (np.zeros(3), 0.05**2 * np.eye(3))
+    unhindered, *_ = resolve_scale(dark, np.zeros(3), None, (0.7, 0.25), log_brightest=dark + 0.1, whites=known)
+    assert np.allclose(unhindered, resolve_scale(dark, np.zeros(3), None, (0.7, 0.25), whites=known)[0], atol=1e-6)
+
+
+def test_a_bound_on_the_brightest_skin_leaves_what_lies_within():
+    """Matt skin under an even light, whose faint highlights ask for skin lighter than any: the answer is not the
+    lightest skin that may be, with what the bound alone leaves open, but the mean of what lies
+    within the bound, here at the mode: 0.8 deviations from it with 0.6 of its deviation, were it one channel alone."""
+    skin = np.log([0.6, 0.4, 0.3])
+    faint = Highlights(np.full(3, 0.45), np.full(3, 50.0), np.full(3, 15.0))
+    free = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25))
+    held = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25), log_brightest=np.log(0.847) + free.log_factor)
+    moved, deviation = held.log_factor - free.log_factor, np.sqrt(np.diag(free.covariance))
+    assert (moved > 0.7 * deviation).all() and (moved < 1.2 * deviation).all()
+    assert (np.sqrt(np.diag(held.covariance)) > 0.5 * deviation).all()
+
+
+def test_the_mean_of_a_bounded_density_is_that_of_the_truncated_normal():
+    """One coordinate of a normal density of given covariance is cut at a wall; the mean moves by the inverse Mills
+    ratio along what goes with that coordinate (Johnson, Kotz, Balakrishnan: Continuous Univariate Distributions 1,
+    13.10)."""
+    covariance = np.array([[0.09, 0.03, 0.0], [0.03, 0.04, 0.01], [0.0, 0.01, 0.16]])
+    middle, whitening = np.array([0.2, -0.1, 0.5]), np.linalg.inv(np.linalg.cholesky(covariance))
+
+    def stated(x):
+        return (x - middle) @ whitening.T
+
+    for wall in (-0.1, 0.2, 0.5):
+        mean, found = mean_of_density(stated, lambda x, at=wall: 1e4 * np.maximum(x[..., :1] - at, 0.0), np.zeros(3))
+        beta = (wall - middle[0]) / 0.3
+        mills = norm.pdf(beta) / norm.cdf(beta)
+        along, kept = covariance[0] / 0.3, 1.0 - beta * mills - mills**2
+        np.testing.assert_allclose(mean, middle - along * mills, atol=0.01)
+        np.testing.assert_allclose(found, covariance - np.outer(along, along) * (1.0 - kept), atol=0.002)
+    mean, found = mean_of_density(stated, lambda x: np.zeros(x.shape), np.zeros(3))
+    np.testing.assert_allclose(mean, middle, atol=1e-6)
+    np.testing.assert_allclose(found, covariance, atol=5e-4)
 
 
 def test_skin_locus_runs_through_the_reference_skins():

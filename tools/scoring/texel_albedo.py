@@ -20,7 +20,7 @@ from shared.imaging.texture import sample_bilinear
 from tools.scoring import measures
 from tools.scoring.align import random_places
 
-RESULT_POINTS, TRUE_POINTS = 200_000, 1_000_000
+RESULT_POINTS, TRUE_POINTS = 50_000, 1_000_000
 NORMAL_MM = 5.0
 """Distance that counts as much as normals one radian apart."""
 FARTHEST_MM, ASIDE_MM = 20.0, 1.0
