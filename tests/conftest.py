@@ -25,21 +25,42 @@ def pytest_configure(config):
         os.environ["LIMN_CACHE"] = folder.name
 
 
+def made_once(tmp_path_factory, worker_id, name, make):
+    """A folder that make(folder) has filled, by whichever worker came first."""
+    if worker_id == "master":
+        folder = tmp_path_factory.mktemp(name)
+        make(folder)
+        return folder
+    folder = tmp_path_factory.getbasetemp().parent / name
+    with open(folder.with_suffix(".lock"), "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        done = folder / "done"
+        if not done.exists():
+            folder.mkdir(exist_ok=True)
+            make(folder)
+            done.touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def tiny_run(tmp_path_factory, worker_id):
     """The folder (work/ and export/) of the tiny subject, from clip to export; made once for all workers."""
     from tools.goldens.tiny import TINY_SUBJECT, run_tiny
 
-    if worker_id == "master":
-        return run_tiny(tmp_path_factory.mktemp("tiny_run"))
-    folder = tmp_path_factory.getbasetemp().parent / "tiny_run"
-    with open(folder.with_suffix(".lock"), "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        done = folder / "done"
-        if not done.exists():
-            run_tiny(folder)
-            done.touch()
-    return folder / TINY_SUBJECT.name
+    return made_once(tmp_path_factory, worker_id, "tiny_run", run_tiny) / TINY_SUBJECT.name
+
+
+@pytest.fixture(scope="session")
+def tiny_scores(tiny_run, tmp_path_factory, worker_id):
+    """The scores of that run's export against the tiny subject's truth; made once for all workers."""
+    from shared.io.arrays import read_json, write_json
+    from tools.goldens.tiny import TINY_SUBJECT
+    from tools.scoring.score import score
+
+    def make(folder):
+        write_json(folder / "scores.json", score(TINY_SUBJECT, tiny_run / "export"))
+
+    return read_json(made_once(tmp_path_factory, worker_id, "tiny_scores", make) / "scores.json")
 
 
 @pytest.fixture(scope="session")

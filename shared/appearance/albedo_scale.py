@@ -188,7 +188,8 @@ def resolve_scale(
     not asked; whites: as chart, of the whites of the eyes.
     With a chart the highlights give s alone: on the scale their range has little to add, and the model's errors pass
     for highlights.
-    -> the mean of log k [3] and its covariance, see mean_of_density, and s, the prior's mean without highlights.
+    -> the mean of log k [3] and its covariance, see mean_of_density, and s; without highlights the most likely k,
+    Laplace's approximation of its covariance, and the prior's mean of s.
     """
     log_radiance = log_albedo + log_irradiance
     matrix, right = scale_prior(log_radiance, white_sigma, relative_light=relative_light)
@@ -215,21 +216,24 @@ def resolve_scale(
             specular = float(np.exp(solved.x[0]))
         return ResolvedScale(alone, specular, np.linalg.inv(matrix.T @ matrix), prior_covariance)
 
-    def stated(x: np.ndarray) -> np.ndarray:
-        on_skin = x[..., :3] @ matrix.T - right
-        if highlights is None:
-            return on_skin
-        return np.concatenate([on_skin, on_highlights(x[..., :3], x[..., 3:])], axis=-1)
+    def on_skin(x: np.ndarray) -> np.ndarray:
+        return x[..., :3] @ matrix.T - right
 
     def too_bright(x: np.ndarray) -> np.ndarray:
         if log_brightest is None:
             return np.zeros((*x.shape[:-1], 3))
         return np.maximum(log_brightest - x[..., :3] - np.log(REFERENCE_SKINS.max()), 0.0) / BRIGHTEST_SIGMA
 
-    start = alone if highlights is None else np.append(alone, np.log(mean))
-    likeliest, covariance = mean_of_density(stated, too_bright, start)
-    specular = mean if highlights is None else float(np.exp(likeliest[3]))
-    return ResolvedScale(likeliest[:3], specular, covariance[:3, :3], prior_covariance)
+    if highlights is None:
+        # The reference skins keep to the bound by themselves: it tells nothing new of what they alone expect.
+        solved = least_squares(lambda x: np.concatenate([on_skin(x), too_bright(x)]), alone, method="lm")
+        return ResolvedScale(solved.x, mean, np.linalg.inv(solved.jac.T @ solved.jac), prior_covariance)
+
+    def stated(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([on_skin(x), on_highlights(x[..., :3], x[..., 3:])], axis=-1)
+
+    expected, covariance = mean_of_density(stated, too_bright, np.append(alone, np.log(mean)))
+    return ResolvedScale(expected[:3], float(np.exp(expected[3])), covariance[:3, :3], prior_covariance)
 
 
 def mean_of_density(

@@ -22,7 +22,7 @@ from tools.bench.chart.runs import ProcessCost, Runs, Solved, fingerprints
 from tools.bench.chart.scores import flat, scores_of
 from tools.bench.runner import Table, run
 from tools.goldens.tiny import TINY_SUBJECT
-from tools.scoring.score import camera_intrinsics, score
+from tools.scoring.score import camera_intrinsics
 
 CLIP = {"frames": 48, "height": 400}
 
@@ -166,10 +166,10 @@ def test_the_truth_scores_as_the_truth(tmp_path):
     assert scores["envmap.lobe25_correlation"] > 0.999 and scores["rerender.psnr"] > 10.0
 
 
-def test_a_solved_stage_is_scored_with_pictures(tiny_run):
+def test_a_solved_stage_is_scored_with_pictures(tiny_run, tiny_scores):
     """Straight from inverse_render's folder: the maps of the export, and re-renders that look like the clip."""
     scores = scores_of(TINY_SUBJECT, tiny_run / "work" / "inverse_render")
-    exported = flat(score(TINY_SUBJECT, tiny_run / "export"))
+    exported = flat(tiny_scores)
     assert scores[ERROR] == pytest.approx(exported[ERROR], abs=0.02)
     assert scores["geometry_mm.median"] == exported["geometry_mm.median"]
     assert scores["rerender.psnr"] == pytest.approx(exported["rerender.psnr"], abs=0.5)

@@ -44,8 +44,8 @@ def test_the_same_comes_out(stage, way, runs):
     assert not list(differences(stage, run.measures, golden))
 
 
-def test_the_chain_is_as_good_as_it_was(tiny_run):
-    assert not list(chain_differences(tiny_run / "export"))
+def test_the_chain_is_as_good_as_it_was(tiny_scores):
+    assert not list(chain_differences(tiny_scores))
 
 
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: m.name)

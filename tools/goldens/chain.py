@@ -28,9 +28,8 @@ NOTICED = {
 """Scores and the least difference of each that anybody would notice, in its own unit (mm, degrees, dE2000, dB)."""
 
 
-def chain_scores(export: Path) -> dict[str, float]:
-    """The scores of one result."""
-    scores = score(TINY_SUBJECT, export)
+def chain_scores(scores: Mapping) -> dict[str, float]:
+    """Those of a result's scores (tools.scoring.score) that are looked at."""
     return {name: float(_entry(scores, name)) for name in NOTICED}
 
 
@@ -55,7 +54,7 @@ def write_chain() -> None:
     found = {}
     for way in KERNELS:
         with tempfile.TemporaryDirectory() as scratch:
-            found[way.name] = chain_scores(run_chain(Path(scratch), way) / "export")
+            found[way.name] = chain_scores(score(TINY_SUBJECT, run_chain(Path(scratch), way) / "export"))
     content = {}
     for name, least in NOTICED.items():
         spread = max(abs(scores[name] - found[OWN.name][name]) for scores in found.values())
@@ -64,10 +63,10 @@ def write_chain() -> None:
     write_json(CHAIN_FILE, content)
 
 
-def chain_differences(export: Path) -> Iterator[str]:
+def chain_differences(scores: Mapping) -> Iterator[str]:
     """What of a result's scores lies farther from the golden ones than it may, one line each."""
     golden = read_json(CHAIN_FILE)
-    for name, value in chain_scores(export).items():
+    for name, value in chain_scores(scores).items():
         entry = golden[name]
         if not abs(value - entry["value"]) <= entry["tolerance"]:
             yield f"{name}: {value:.4g} instead of {entry['value']:.4g} +- {entry['tolerance']:.2g}"
