@@ -12,7 +12,8 @@ distribution over logarithms, and the whites of the eyes (eye_whites) and a char
 A fourth only keeps the skin's brightest places from returning more than the lightest reference skin.
 
 With u [3] the log of the mean irradiance on the skin and y [3] the log of the mean radiance that it returns, albedo is
-exp(y - u) and all of it is one quadratic in u, but for the fourth and for highlights: what is taken is the mean.
+exp(y - u) and all of it is one quadratic in u, but for the fourth and for highlights. Steps take the most likely
+factor; the solution has the one that is expected in the mean (fit.at_mean_scale).
 
 References: skin I to VI of the Physically Based database (physicallybased.info, CC0), the same that OpenPBR viewers
 offer; ColorChecker patches "light skin" and "dark skin" (sRGB values of X-Rite, November 2014).
@@ -73,13 +74,15 @@ class Highlights:
 
 
 class ResolvedScale(NamedTuple):
-    """log_factor [3] on the light, the specular intensity, and the covariance [3, 3] of the former: of all statements
-    together, and prior_covariance [3, 3] of those on skin and light alone, which say something of any clip."""
+    """The most likely log_factor [3] on the light and the specular intensity; the covariance [3, 3] of the former, of
+    all statements together, and prior_covariance [3, 3] of those on skin and light alone, which say something of any
+    clip; beyond [4]: from the most likely to the mean, of the log factor and of the log intensity."""
 
     log_factor: np.ndarray
     specular: float
     covariance: np.ndarray
     prior_covariance: np.ndarray
+    beyond: np.ndarray = np.zeros(4)
 
     def describe(self, skin: np.ndarray) -> dict:
         """What solve.json says of how well skin's albedo [3] is known: deviations of logarithms, the interval that
@@ -178,7 +181,7 @@ def resolve_scale(
     whites: tuple[np.ndarray, np.ndarray] | None = None,
     tints: Sequence[LightTint | None] = (),
 ) -> ResolvedScale:
-    """The factor on the light per channel and the specular intensity that all statements together expect.
+    """The factor on the light per channel and the specular intensity that are jointly most likely.
 
     The lobe returns the light's own colour and its strength has a known range, so highlights say something about the
     scale that diffuse skin cannot: with the light multiplied by k, channel c wants s k_c = t_c. log_albedo,
@@ -188,8 +191,8 @@ def resolve_scale(
     not asked; whites: as chart, of the whites of the eyes.
     With a chart the highlights give s alone: on the scale their range has little to add, and the model's errors pass
     for highlights.
-    -> the mean of log k [3] and its covariance, see mean_of_density, and s; without highlights the most likely k,
-    Laplace's approximation of its covariance, and the prior's mean of s.
+    -> log k and s, without highlights the prior's mean of s; how far the mean lies from there, and the covariance: with
+    highlights those of mean_of_density, else none and Laplace's.
     """
     log_radiance = log_albedo + log_irradiance
     matrix, right = scale_prior(log_radiance, white_sigma, relative_light=relative_light)
@@ -232,21 +235,22 @@ def resolve_scale(
     def stated(x: np.ndarray) -> np.ndarray:
         return np.concatenate([on_skin(x), on_highlights(x[..., :3], x[..., 3:])], axis=-1)
 
-    expected, covariance = mean_of_density(stated, too_bright, np.append(alone, np.log(mean)))
-    return ResolvedScale(expected[:3], float(np.exp(expected[3])), covariance[:3, :3], prior_covariance)
+    start = np.append(alone, np.log(mean))
+    mode = least_squares(lambda x: np.concatenate([stated(x), too_bright(x)]), start, method="lm").x
+    expected, covariance = mean_of_density(stated, too_bright, mode)
+    return ResolvedScale(mode[:3], float(np.exp(mode[3])), covariance[:3, :3], prior_covariance, expected - mode)
 
 
 def mean_of_density(
-    stated: Callable[[np.ndarray], np.ndarray], bounding: Callable[[np.ndarray], np.ndarray], start: np.ndarray
+    stated: Callable[[np.ndarray], np.ndarray], bounding: Callable[[np.ndarray], np.ndarray], mode: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean [n] and covariance [n, n] of the density exp(-(|stated(x)|^2 + |bounding(x)|^2) / 2), n up to 4.
 
-    stated, bounding: residuals [..., m] of x [..., n]; the latter are 0 but beyond a bound. start [n]: where the search
-    for the mode begins. Where a bound cuts the density, its mode lies on the bound and the curvature there is the
-    bound's own, while most of the density lies within: so neither mode nor Laplace's approximation will do. Importance
-    sampling about the mode [Geweke1989], with pairs of opposite points, by which the mean of a normal density is exact.
+    stated, bounding: residuals [..., m] of x [..., n]; the latter are 0 but beyond a bound. mode [n]: of the density.
+    Where a bound cuts it, the mode lies on the bound and the curvature there is the bound's own, while most of the
+    density lies within: so neither mode nor Laplace's approximation will do. Importance sampling about the mode
+    [Geweke1989], with pairs of opposite points, by which the mean of a normal density is exact.
     """
-    mode = least_squares(lambda x: np.concatenate([stated(x), bounding(x)]), start, method="lm").x
     jacobian = least_squares(stated, mode, method="lm", max_nfev=1).jac
     unbounded = np.linalg.inv(jacobian.T @ jacobian)
     normal = _opposite_points(len(mode))

@@ -15,7 +15,7 @@ from shared.appearance.light_weights import weigh_samples
 from shared.appearance.local_roughness import SpecularEquations
 from shared.appearance.observations import Capture
 from shared.appearance.problem import AppearanceProblem, AppearanceSettings, AppearanceState
-from shared.appearance.projection import LARGEST_ROUGHNESS_STEP, changed_roughness
+from shared.appearance.projection import LARGEST_ROUGHNESS_STEP, SPECULAR_RANGE, changed_roughness
 from shared.appearance.sample_errors import SampleErrors
 from shared.rendering.near_lamp import NearLamp
 
@@ -202,6 +202,21 @@ def fit_appearance(
         frame_errors=found.frame_errors, light_weights=found.light_weights, scale=found.scale,
         lamp=None if capture.lamp is None else capture.lamp.lamp,
     )
+
+
+def at_mean_scale(solution: Solution) -> Solution:
+    """The solution with light, albedo and specular intensity of the scale that is expected in the mean, in place of the
+    most likely one: what diffuse skin sends out stays as it is. Unchanged where the scale was not at rest."""
+    if solution.scale is None:
+        return solution
+    state, log_factor = solution.state, solution.scale.beyond[:3]
+    state = replace(
+        state,
+        params=state.light_model.scaled(state.params, log_factor),
+        albedo=state.albedo * np.exp(-log_factor),
+        specular=float(np.clip(state.specular * np.exp(solution.scale.beyond[3]), *SPECULAR_RANGE)),
+    )
+    return replace(solution, state=state)
 
 
 def fit_all_points(

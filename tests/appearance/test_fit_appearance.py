@@ -17,7 +17,8 @@ from toy_capture import (
     true_light,
 )
 
-from shared.appearance.fit import fit_all_points, fit_appearance
+from shared.appearance.albedo_scale import ResolvedScale
+from shared.appearance.fit import at_mean_scale, fit_all_points, fit_appearance
 from shared.appearance.problem import AppearanceSettings
 from shared.appearance.projection import ROUGHNESS_RANGE, changed_roughness, reached_end
 from shared.contract.records import SOLVE
@@ -95,6 +96,16 @@ def test_the_fit_goes_on_until_the_scale_rests(truth):
     found = fit_appearance(truth[0], settings)
     assert found.highlights_count and len(after_shaping(found)) > 2 and len(found.iterations) < 20
     assert found.iterations[-1]["rescaled"] < 0.01
+
+
+def test_the_mean_scale_keeps_what_skin_sends_out(solution):
+    beyond = np.array([0.2, 0.1, -0.3, -0.15])
+    scale = ResolvedScale(np.zeros(3), 0.7, 0.04 * np.eye(3), np.eye(3), beyond)
+    moved = at_mean_scale(replace(solution, scale=scale)).state
+    np.testing.assert_allclose(moved.light, solution.state.light * np.exp(beyond[:3]), rtol=1e-6)
+    np.testing.assert_allclose(moved.albedo, solution.state.albedo * np.exp(-beyond[:3]), rtol=1e-6)
+    assert moved.specular == pytest.approx(solution.state.specular * np.exp(-0.15))
+    assert at_mean_scale(replace(solution, scale=None)).state is solution.state
 
 
 def test_the_fit_stops_where_held_out_frames_stop_improving(matte):

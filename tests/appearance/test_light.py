@@ -175,10 +175,10 @@ def test_highlights_tell_a_bright_light_from_bright_skin():
     """All statements agree on the factor 1/2: light twice too bright, so highlights look half as strong."""
     skin, mean = on_the_locus(), (0.7, 0.35)
     light = np.full(3, np.log(2.0))
-    found = Highlights(np.full(3, 0.35), np.full(3, 1e6), np.ones(3))
+    found = Highlights(np.full(3, 0.35), np.full(3, 100.0), np.ones(3))
     log_factor, specular, *_ = resolve_scale(skin - light, light, found, mean)
-    assert np.allclose(log_factor, -np.log(2.0), atol=0.03), "highlights are log-normal only nearly"
-    assert specular == pytest.approx(0.7, rel=0.01)
+    assert np.allclose(log_factor, -np.log(2.0), atol=1e-6)
+    assert specular == pytest.approx(0.7, rel=1e-6)
     without, specular, *_ = resolve_scale(skin - light, light, None, mean)
     assert np.allclose(without, -np.log(2.0), atol=1e-6) and specular == 0.7
     stronger = Highlights(np.full(3, 0.7), np.full(3, 100.0), np.ones(3))
@@ -245,9 +245,11 @@ def test_a_bound_on_the_brightest_skin_leaves_what_lies_within():
     faint = Highlights(np.full(3, 0.45), np.full(3, 50.0), np.full(3, 15.0))
     free = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25))
     held = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25), log_brightest=np.log(0.847) + free.log_factor)
-    moved, deviation = held.log_factor - free.log_factor, np.sqrt(np.diag(free.covariance))
+    moved, deviation = held.log_factor + held.beyond[:3] - free.log_factor, np.sqrt(np.diag(free.covariance))
     assert (moved > 0.7 * deviation).all() and (moved < 1.2 * deviation).all()
+    assert (np.abs(held.log_factor - free.log_factor) < 0.2 * deviation).all(), "the most likely lies on the bound"
     assert (np.sqrt(np.diag(held.covariance)) > 0.5 * deviation).all()
+    assert np.array_equal(resolve_scale(skin, np.zeros(3), None, (0.7, 0.25)).beyond, np.zeros(4))
 
 
 def test_the_mean_of_a_bounded_density_is_that_of_the_truncated_normal():
@@ -261,13 +263,14 @@ def test_the_mean_of_a_bounded_density_is_that_of_the_truncated_normal():
         return (x - middle) @ whitening.T
 
     for wall in (-0.1, 0.2, 0.5):
-        mean, found = mean_of_density(stated, lambda x, at=wall: 1e4 * np.maximum(x[..., :1] - at, 0.0), np.zeros(3))
+        mode = middle + covariance[0] / covariance[0, 0] * min(wall - middle[0], 0.0)
+        mean, found = mean_of_density(stated, lambda x, at=wall: 1e4 * np.maximum(x[..., :1] - at, 0.0), mode)
         beta = (wall - middle[0]) / 0.3
         mills = norm.pdf(beta) / norm.cdf(beta)
         along, kept = covariance[0] / 0.3, 1.0 - beta * mills - mills**2
         np.testing.assert_allclose(mean, middle - along * mills, atol=0.01)
         np.testing.assert_allclose(found, covariance - np.outer(along, along) * (1.0 - kept), atol=0.002)
-    mean, found = mean_of_density(stated, lambda x: np.zeros(x.shape), np.zeros(3))
+    mean, found = mean_of_density(stated, lambda x: np.zeros(x.shape), middle)
     np.testing.assert_allclose(mean, middle, atol=1e-6)
     np.testing.assert_allclose(found, covariance, atol=5e-4)
 
