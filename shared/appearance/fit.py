@@ -227,13 +227,14 @@ def fit_all_points(
 ) -> Solution:
     """The solution of a whole capture from that of some of its points, whose light is at rest: roughness, strength of
     highlights, scale and albedo under that light, then one step of everything, kept where it serves. Its records follow
-    the coarse one's.
+    the coarse one's, and where its scale still waits what is known of the scale is the coarse one's.
 
     Unknowns of the light are few beside samples even of a quarter of the points, and Gauss-Newton steps from there
     converge at once; what takes many steps is the way to the first shape of the light, and roughness and scale in turn.
     """
     whole = fit_appearance(capture, replace(settings, steps=2), report, start=coarse, keep_start=True)
-    return replace(whole, iterations=coarse.iterations + whole.iterations)
+    scale = coarse.scale if whole.scale is None else whole.scale
+    return replace(whole, iterations=coarse.iterations + whole.iterations, scale=scale)
 
 
 def step(

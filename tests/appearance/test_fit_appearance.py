@@ -202,6 +202,13 @@ def test_some_points_say_what_the_light_is_and_a_last_step_on_all_finishes(truth
     assert abs(np.log(np.median(found.state.albedo / exact.state.albedo))) < settings.white_sigma
     assert found.held_out < 1.1 * exact.held_out
 
+    def waiting(*args, **words):
+        state, report = honest(*args, **words)
+        return state, replace(report, scale=None)
+
+    monkeypatch.setattr(module, "step", waiting)
+    assert coarse.scale is not None and fit_all_points(capture, settings, coarse).scale is coarse.scale
+
 
 def test_no_fewer_points_are_chosen_where_there_are_no_more(truth):
     capture = truth[0]
