@@ -214,6 +214,7 @@ def at_mean_scale(solution: Solution) -> Solution:
         state,
         params=state.light_model.scaled(state.params, log_factor),
         albedo=state.albedo * np.exp(-log_factor),
+        node_albedo=state.node_albedo * np.exp(-log_factor),
         specular=float(np.clip(state.specular * np.exp(solution.scale.beyond[3]), *SPECULAR_RANGE)),
     )
     return replace(solution, state=state)

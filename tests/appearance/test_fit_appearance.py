@@ -104,6 +104,7 @@ def test_the_mean_scale_keeps_what_skin_sends_out(solution):
     moved = at_mean_scale(replace(solution, scale=scale)).state
     np.testing.assert_allclose(moved.light, solution.state.light * np.exp(beyond[:3]), rtol=1e-6)
     np.testing.assert_allclose(moved.albedo, solution.state.albedo * np.exp(-beyond[:3]), rtol=1e-6)
+    np.testing.assert_allclose(moved.node_albedo, solution.state.node_albedo * np.exp(-beyond[:3]), rtol=1e-6)
     assert moved.specular == pytest.approx(solution.state.specular * np.exp(-0.15))
     assert at_mean_scale(replace(solution, scale=None)).state is solution.state
 
