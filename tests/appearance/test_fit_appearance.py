@@ -203,8 +203,8 @@ def test_some_points_say_what_the_light_is_and_a_last_step_on_all_finishes(truth
     assert abs(np.log(np.median(found.state.albedo / exact.state.albedo))) < settings.white_sigma
     assert found.held_out < 1.1 * exact.held_out
 
-    def waiting(*args, **words):
-        state, report = honest(*args, **words)
+    def waiting(problem, state, highlights_count, light_moves):
+        state, report = honest(problem, state, highlights_count, light_moves)
         return state, replace(report, scale=None)
 
     monkeypatch.setattr(module, "step", waiting)

@@ -199,16 +199,23 @@ def test_what_is_known_of_the_scale_adds_up_as_precisions():
     np.testing.assert_allclose(alone.covariance, alone.prior_covariance, rtol=1e-4)
     said = np.diag([0.02, 0.03, 0.05]) ** 2
     both = resolve_scale(skin, np.zeros(3), None, prior, chart=(np.zeros(3), said))
-    np.testing.assert_allclose(
-        both.covariance, np.linalg.inv(np.linalg.inv(alone.prior_covariance) + np.linalg.inv(said))
-    )
+    np.testing.assert_allclose(both.covariance, np.linalg.inv(np.linalg.inv(alone.covariance) + np.linalg.inv(said)))
     shine = resolve_scale(skin, np.zeros(3), Highlights(np.full(3, 0.7), np.full(3, 1e6), np.ones(3)), prior)
     jointly = np.zeros((4, 4))  # of the three factors and of the intensity, which highlights show the product of
     jointly[:3, :3], jointly[3, 3] = np.linalg.inv(alone.covariance), prior[1] ** -2
+    known, spread = jointly.copy(), 0.7 * np.sqrt(HIGHLIGHT_SIGMA**2 + MODEL_ERROR**2)
     for channel in np.eye(4)[:3] + np.eye(4)[3]:
-        jointly += np.outer(channel, channel) / (HIGHLIGHT_SIGMA**2 + MODEL_ERROR**2)
-    share = shine.covariance / np.linalg.inv(jointly)[:3, :3]
-    assert (share > 1.0).all() and (share < 1.1).all(), "tails of highlights are heavier than a normal density's"
+        jointly += np.outer(channel, channel) * (0.7 / spread) ** 2
+    # Their tails are heavier than a normal density's: summed over a grid of the normal one's axes.
+    steps = np.linspace(-6.0, 6.0, 21)
+    x = np.stack(np.meshgrid(*[steps] * 4), -1).reshape(-1, 4) @ np.linalg.cholesky(np.linalg.inv(jointly)).T
+    off = (0.7 * np.exp(x[:, :3] + x[:, 3:]) - 0.7) / spread
+    density = np.exp(-0.5 * ((x @ known) * x).sum(1) - (np.sqrt(1.0 + off**2) - 1.0).sum(1))
+    density /= density.sum()
+    around = x - density @ x
+    expected = (density[:, None] * around).T @ around
+    np.testing.assert_allclose(shine.covariance, expected[:3, :3], rtol=0.01)
+    assert (np.diag(expected) > np.diag(np.linalg.inv(jointly))).all()
 
 
 def test_the_record_of_the_scale_states_its_interval():
@@ -232,15 +239,15 @@ def test_no_skin_returns_more_than_the_lightest():
     held, *_ = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25), log_brightest=skin + 0.15)
     assert np.exp(skin + 0.15 - free).max() > 1.0
     assert np.exp(skin + 0.15 - held).max() < 0.95
-    dark, known = on_the_locus(), (np.zeros(3), 0.05**2 * np.eye(3))
-    unhindered, *_ = resolve_scale(dark, np.zeros(3), None, (0.7, 0.25), log_brightest=dark + 0.1, whites=known)
-    assert np.allclose(unhindered, resolve_scale(dark, np.zeros(3), None, (0.7, 0.25), whites=known)[0], atol=1e-6)
+    dark = on_the_locus()
+    unhindered, *_ = resolve_scale(dark, np.zeros(3), None, (0.7, 0.25), log_brightest=dark + 0.15)
+    assert np.allclose(unhindered, resolve_scale(dark, np.zeros(3), None, (0.7, 0.25))[0], atol=1e-6)
 
 
 def test_a_bound_on_the_brightest_skin_leaves_what_lies_within():
     """Matt skin under an even light, whose faint highlights ask for skin lighter than any: the answer is not the
-    lightest skin that may be, with what the bound alone leaves open, but the mean of what lies
-    within the bound, here at the mode: 0.8 deviations from it with 0.6 of its deviation, were it one channel alone."""
+    lightest skin that may be, with what the bound alone leaves open, but the mean of what lies within the bound, here
+    at the mode: 0.8 deviations from it with 0.6 of its deviation, were it one channel alone."""
     skin = np.log([0.6, 0.4, 0.3])
     faint = Highlights(np.full(3, 0.45), np.full(3, 50.0), np.full(3, 15.0))
     free = resolve_scale(skin, np.zeros(3), faint, (0.7, 0.25))
