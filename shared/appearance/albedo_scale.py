@@ -191,8 +191,8 @@ def resolve_scale(
     not asked; whites: as chart, of the whites of the eyes.
     With a chart the highlights give s alone: on the scale their range has little to add, and the model's errors pass
     for highlights.
-    -> log k and s, without highlights the prior's mean of s; how far the mean lies from there, and the covariance: with
-    highlights those of mean_of_density, else none and Laplace's.
+    -> log k and s, without highlights the prior's mean of s; how far the mean lies from there, with highlights only, and
+    the covariance: mean_of_density's where highlights or a bound take part, else the normal distribution's.
     """
     log_radiance = log_albedo + log_irradiance
     matrix, right = scale_prior(log_radiance, white_sigma, relative_light=relative_light)
@@ -228,9 +228,13 @@ def resolve_scale(
         return np.maximum(log_brightest - x[..., :3] - np.log(REFERENCE_SKINS.max()), 0.0) / BRIGHTEST_SIGMA
 
     if highlights is None:
-        # The reference skins keep to the bound by themselves: it tells nothing new of what they alone expect.
-        solved = least_squares(lambda x: np.concatenate([on_skin(x), too_bright(x)]), alone, method="lm")
-        return ResolvedScale(solved.x, mean, np.linalg.inv(solved.jac.T @ solved.jac), prior_covariance)
+        # The reference skins keep to the bound by themselves: it tells nothing new of what they alone expect. But where
+        # the mode lies on it, its curvature is not what is known.
+        mode = least_squares(lambda x: np.concatenate([on_skin(x), too_bright(x)]), alone, method="lm").x
+        covariance = np.linalg.inv(matrix.T @ matrix)
+        if log_brightest is not None:
+            _, covariance = mean_of_density(on_skin, too_bright, mode)
+        return ResolvedScale(mode, mean, covariance, prior_covariance)
 
     def stated(x: np.ndarray) -> np.ndarray:
         return np.concatenate([on_skin(x), on_highlights(x[..., :3], x[..., 3:])], axis=-1)

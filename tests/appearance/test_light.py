@@ -257,6 +257,11 @@ def test_a_bound_on_the_brightest_skin_leaves_what_lies_within():
     assert (np.abs(held.log_factor - free.log_factor) < 0.2 * deviation).all(), "the most likely lies on the bound"
     assert (np.sqrt(np.diag(held.covariance)) > 0.5 * deviation).all()
     assert np.array_equal(resolve_scale(skin, np.zeros(3), None, (0.7, 0.25)).beyond, np.zeros(4))
+    alone = resolve_scale(skin, np.zeros(3), None, (0.7, 0.25))
+    matt = resolve_scale(skin, np.zeros(3), None, (0.7, 0.25), log_brightest=np.log(0.847) + alone.log_factor)
+    np.testing.assert_allclose(matt.log_factor, alone.log_factor, atol=1e-6)
+    spread = np.sqrt(np.diag(matt.covariance) / np.diag(alone.covariance))
+    assert (0.5 < spread).all() and (spread < 0.75).all(), "half of a normal density spreads by 0.6 of it"
 
 
 def test_the_mean_of_a_bounded_density_is_that_of_the_truncated_normal():
