@@ -71,7 +71,7 @@ PUBLISHED = ParameterGroup(
 
 STAGE = Stage(
     name="inverse_render",
-    version=45,
+    version=46,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -134,7 +134,8 @@ STAGE = Stage(
                   "scale over the skin of a face.", "", 0.01, 10.0, former="skin_brightness"),
         Parameter("skin_colour_sigma", float, 0.1, "The same of its colour, per channel about their mean.", "",
                   0.01, 10.0, former="skin_colour"),
-        Parameter("light_smoothness", float, 1.0, "Weight of the light's smoothness.", "", 0.0, 1000.0),
+        Parameter("light_smoothness", float, 1.0, "Weight of the light's smoothness; the last steps keep a tenth.", "",
+                  0.0, 1000.0),
         Parameter("independent_samples", float, 5000.0, "How many independent samples the clip counts as.", "", 10.0,
                   1e7, former="evidence"),
         Parameter("chart", bool, True, "Take the light's scale from the colour chart that sample_frames found."),

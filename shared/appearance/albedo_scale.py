@@ -191,8 +191,8 @@ def resolve_scale(
     not asked; whites: as chart, of the whites of the eyes.
     With a chart the highlights give s alone: on the scale their range has little to add, and the model's errors pass
     for highlights.
-    -> log k and s, without highlights the prior's mean of s; how far the mean lies from there, with highlights only, and
-    the covariance: mean_of_density's where highlights or a bound take part, else the normal distribution's.
+    -> log k and s, without highlights the prior's mean of s; how far the mean lies from there, with highlights only;
+    and the covariance: mean_of_density's where highlights or a bound take part, else the normal distribution's.
     """
     log_radiance = log_albedo + log_irradiance
     matrix, right = scale_prior(log_radiance, white_sigma, relative_light=relative_light)

@@ -33,6 +33,9 @@ _CONVERGED_SCALE = 0.01
 """A resolution goes on while a step changes the light's scale by more than this, in the logarithm: highlights say what
 it is, for the roughness of the moment, and the residual hardly feels it. Without highlights the priors alone do."""
 
+_LAST_STEPS = 3
+"""At most, of fit_sharper_light."""
+
 _ROUGHNESS_STEPS = 8
 """At most, of the roughness by itself before a step of all."""
 
@@ -150,7 +153,8 @@ def fit_appearance(
     The first steps, and those after a change of the light's model, only give the light its shape (Phase.SHAPING);
     highlights, which then begin to say something about the scale, take part after those, but not again after
     a step that had to be undone. Only states after the first steps, of the light model asked for, can win, or the one
-    that a step was undone to; of those that do about as well the last, whose scale has come to rest.
+    that a step was undone to, and none whose scale waits where there is one whose scale is resolved; of those that do
+    about as well the last, whose scale has come to rest.
     """
     problem = AppearanceProblem.of(capture, settings)
     records, best, schedule = [], None, settings.light_schedule
@@ -185,9 +189,11 @@ def fit_appearance(
             report(record)
             judged = found.judged(capture, settings.independent)
             if phase is Phase.SOLVING and model == settings.light_model:
-                lowest = judged if best is None else min(judged, best[0])
-                if best is None or judged <= lowest * (1.0 + _WORTHWHILE):
-                    best = (lowest, found, state.appearance)
+                settled = found.scale is not None
+                if best is None or settled and best[1].scale is None:
+                    best = (judged, found, state.appearance)
+                elif (settled or best[1].scale is None) and judged <= best[0] * (1.0 + _WORTHWHILE):
+                    best = (min(judged, best[0]), found, state.appearance)
             if phase is Phase.SHAPING:
                 change = abs(found.fitted / last_fitted - 1.0)
                 if number + 1 >= shaping_steps and change < _SHAPED or number + 2 >= settings.steps:
@@ -218,6 +224,26 @@ def at_mean_scale(solution: Solution) -> Solution:
         specular=float(np.clip(state.specular * np.exp(solution.scale.beyond[3]), *SPECULAR_RANGE)),
     )
     return replace(solution, state=state)
+
+
+def fit_sharper_light(
+    capture: Capture,
+    settings: AppearanceSettings,
+    solution: Solution,
+    report: Callable[[dict], None] = lambda record: None,
+) -> Solution:
+    """A capture's solution after some last steps under settings.at_last, unless held-out frames are against them; their
+    records follow in either case.
+
+    Diffuse skin shows the light's broad part times the albedo, highlights its lamps times their intensity. So a smooth
+    prior on the light has a way to flatten lamps that samples hardly oppose: a darker albedo under a brighter light and
+    a higher intensity. While shape and poses are being found their errors would pass for lamps without it.
+    """
+    last = fit_appearance(capture, replace(settings.at_last, steps=_LAST_STEPS), report, start=solution)
+    iterations = solution.iterations + last.iterations
+    if last.held_out > solution.held_out * (1.0 + _WORTHWHILE):
+        return replace(solution, iterations=iterations)
+    return replace(last, iterations=iterations, scale=solution.scale if last.scale is None else last.scale)
 
 
 def fit_all_points(

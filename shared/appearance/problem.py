@@ -44,6 +44,8 @@ Value = TypeVar("Value")
 
 _POINTS_PER_BLOCK = 512
 
+LAST_SMOOTHNESS = 0.1
+"""Share of the light's smoothness that the last steps keep (see fit.fit_sharper_light)."""
 PATCH_MM = 50.0
 """Of skin whose errors of the model count as one: a cheek, half a forehead."""
 
@@ -79,6 +81,11 @@ class AppearanceSettings:
         """What moves against the light, in a clip in which the head or the camera moves: a lamp at the camera goes
         with it, so that the head moves in any clip."""
         return "head" if self.light_model == "camera" else moves
+
+    @property
+    def at_last(self) -> AppearanceSettings:
+        """Those of the last steps, once shape and poses stand."""
+        return replace(self, priors=replace(self.priors, smooth=LAST_SMOOTHNESS * self.priors.smooth))
 
     @property
     def light_schedule(self) -> tuple[tuple[str, int], ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from shared.appearance.chart_scale import ChartStatement, describe_scale, scale_warnings, state_chart
 from shared.appearance.diagnostics import diagnostic_warnings, diagnostics_of, face_regions
 from shared.appearance.eye_whites import describe_whites
-from shared.appearance.fit import Solution, at_mean_scale, fit_all_points, fit_appearance
+from shared.appearance.fit import Solution, at_mean_scale, fit_all_points, fit_appearance, fit_sharper_light
 from shared.appearance.light_models import SeveralLights
 from shared.appearance.local_roughness import local_roughness
 from shared.appearance.problem import AppearanceProblem, AppearanceSettings
@@ -88,8 +88,9 @@ def solve_clip(
     shaped = shape_and_turn(views, lit, solution, settings, chart, tracked, context)
     views, lit, solution = shaped.views, shaped.lit, shaped.solution
     shape_record = {"refined": False} | shaped.shape_record
+    solution = fit_sharper_light(lit.coarse, settings.appearance, solution, report_to(context))
     if lit.coarse is not lit.capture:
-        solution = fit_all_points(lit.capture, settings.appearance, solution, report_to(context))
+        solution = fit_all_points(lit.capture, settings.appearance.at_last, solution, report_to(context))
     diagnostics, solution, whites = examine(lit, settings.appearance, at_mean_scale(solution))
 
     # Under that light, of that shape: every texel's material, and relief finer than the mesh.

@@ -18,7 +18,7 @@ from toy_capture import (
 )
 
 from shared.appearance.albedo_scale import ResolvedScale
-from shared.appearance.fit import at_mean_scale, fit_all_points, fit_appearance
+from shared.appearance.fit import at_mean_scale, fit_all_points, fit_appearance, fit_sharper_light
 from shared.appearance.problem import AppearanceSettings
 from shared.appearance.projection import ROUGHNESS_RANGE, changed_roughness, reached_end
 from shared.contract.records import SOLVE
@@ -81,10 +81,14 @@ def test_residuals_come_down_to_the_noise(solution):
 
 
 def test_the_last_of_the_best_held_out_states_wins(truth, solution):
-    """Where the prior on skin has nothing against it."""
+    """Where the prior on skin has nothing against it, and the scale did not wait for the roughness."""
     count = AppearanceSettings().independent * (~truth[0].fitted).mean()
     records = after_shaping(solution)
     judged = np.array([record["held_out"] * np.sqrt(1.0 + 2.0 * record["skin_prior"] / count) for record in records])
+    change = np.diff(np.log([record["roughness"] for record in solution.iterations]))[-len(records):]
+    waiting = np.abs(change) > 0.03
+    assert waiting.any() and judged[waiting].min() < judged[~waiting].min(), "without the rule one of them would win"
+    judged[waiting] = np.inf
     last = int(np.nonzero(judged <= 1.003 * judged.min())[0][-1])
     assert solution.held_out == records[last]["held_out"]
     assert solution.iterations[0]["held_out"] > 2.0 * solution.held_out
@@ -156,6 +160,25 @@ def test_highlights_wait_while_a_light_of_fewer_numbers_takes_shape():
     assert not reached_end(found.state.roughness, ROUGHNESS_RANGE) and found.highlights_count
     assert found.held_out < 0.011
     assert np.abs(np.log(np.median(found.state.albedo / albedo, axis=0))).max() < 0.2
+
+
+def test_a_light_smoothed_less_at_last_finds_its_lamp():
+    """A small lamp in the dark, under ten times the usual prior: flattened, with a darker skin under more light. Last
+    steps with a tenth of it give both back; where held-out frames would have it otherwise, nothing changes."""
+    capture, albedo, _ = make_truth(lights=(small_lamp,))
+    settings = AppearanceSettings(resolutions=(8,), steps=12, noise=(0.003, 0.01), roughness=0.45)
+    dull = replace(settings, priors=replace(settings.priors, smooth=10.0 * settings.priors.smooth))
+    assert dull.at_last.priors == settings.priors
+    before = fit_appearance(capture, dull)
+    after = fit_sharper_light(capture, dull, before)
+    contrast = [np.log(fit.state.light).std() for fit in (before, after)]
+    level = [abs(np.log(np.median(fit.state.albedo / albedo, axis=0)).mean()) for fit in (before, after)]
+    assert contrast[1] > 1.2 * contrast[0] and level[1] < 0.6 * level[0]
+    assert after.held_out < 0.95 * before.held_out
+    assert after.iterations[: len(before.iterations)] == before.iterations and after.scale is not None
+    best = replace(before, held_out=0.5 * after.held_out)
+    kept = fit_sharper_light(capture, dull, best)
+    assert kept.state is best.state and kept.iterations == after.iterations
 
 
 def test_a_fit_goes_on_from_a_solution(truth, solution):

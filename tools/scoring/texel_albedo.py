@@ -89,8 +89,8 @@ def albedo_pairs(
 
 def _nearest(places: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance [N] to and index [N] of the nearest of random places [P, 6] to each wanted [N, 6]; inf beyond
-    FARTHEST_MM. Those that are not near have the nearest of one place in THINNED: to look through all of them would take
-    a hundred times as long as where a place is near."""
+    FARTHEST_MM. Those that are not near have the nearest of one place in THINNED: to look through all of them would
+    take a hundred times as long as where a place is near."""
     apart, nearest = cKDTree(places[::THINNED]).query(wanted, distance_upper_bound=FARTHEST_MM)
     nearest *= THINNED
     near = np.nonzero(apart < NEAR_MM)[0]
