@@ -231,8 +231,9 @@ def resolve_scale(
         # The reference skins keep to the bound by themselves: it tells nothing new of what they alone expect. But where
         # the mode lies on it, its curvature is not what is known.
         mode = least_squares(lambda x: np.concatenate([on_skin(x), too_bright(x)]), alone, method="lm").x
-        covariance = np.linalg.inv(matrix.T @ matrix)
-        if log_brightest is not None:
+        if log_brightest is None:
+            covariance = np.linalg.inv(matrix.T @ matrix)
+        else:
             _, covariance = mean_of_density(on_skin, too_bright, mode)
         return ResolvedScale(mode, mean, covariance, prior_covariance)
 

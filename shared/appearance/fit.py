@@ -240,10 +240,9 @@ def fit_sharper_light(
     a higher intensity. While shape and poses are being found their errors would pass for lamps without it.
     """
     last = fit_appearance(capture, replace(settings.at_last, steps=_LAST_STEPS), report, start=solution)
-    iterations = solution.iterations + last.iterations
     if last.held_out > solution.held_out * (1.0 + _WORTHWHILE):
-        return replace(solution, iterations=iterations)
-    return replace(last, iterations=iterations, scale=solution.scale if last.scale is None else last.scale)
+        return replace(solution, iterations=solution.iterations + last.iterations)
+    return _continued(solution, last)
 
 
 def fit_all_points(
@@ -260,8 +259,13 @@ def fit_all_points(
     converge at once; what takes many steps is the way to the first shape of the light, and roughness and scale in turn.
     """
     whole = fit_appearance(capture, replace(settings, steps=2), report, start=coarse, keep_start=True)
-    scale = coarse.scale if whole.scale is None else whole.scale
-    return replace(whole, iterations=coarse.iterations + whole.iterations, scale=scale)
+    return _continued(coarse, whole)
+
+
+def _continued(before: Solution, after: Solution) -> Solution:
+    """The later solution with the records of both; where its scale waits, what is known of it is the earlier one's."""
+    scale = before.scale if after.scale is None else after.scale
+    return replace(after, iterations=before.iterations + after.iterations, scale=scale)
 
 
 def step(

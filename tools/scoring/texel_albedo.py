@@ -69,8 +69,7 @@ def albedo_pairs(
     true_mesh, true_albedo, poses = truth
     mesh, albedo, confidence = result
     points, normals, uv, _ = _spread(true_mesh, TRUE_POINTS, rng)
-    shown = _shown(true_mesh, points, normals, poses)
-    shown = np.nonzero(shown)[0]
+    shown = np.nonzero(_shown(true_mesh, points, normals, poses))[0]
     own_points, own_normals, own_uv, face = _spread(mesh, RESULT_POINTS, rng)
     own_points, own_normals = truth_from_result.points(own_points), own_normals @ truth_from_result.rotation.T
     apart, nearest = _nearest(np.concatenate([points[shown], NORMAL_MM * normals[shown]], 1),
