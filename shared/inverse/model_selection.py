@@ -16,6 +16,7 @@ from shared.appearance.chart_scale import ChartStatement
 from shared.appearance.fit import Solution, fit_all_points
 from shared.appearance.observations import Capture
 from shared.compute.run_context import RunContext
+from shared.compute.threads import single_thread
 from shared.geometry.surface import Surface
 from shared.imaging.frame_index import hold_out
 from shared.imaging.image_sampling import texel_size
@@ -78,10 +79,12 @@ def select(
         context.note(f"model selection: {text}; {said} ({record['seconds']:.1f} s)")
 
     candidates = allowed_candidates(settings.appearance, settings.selection)
-    present = ModelSelection(capture, settings.appearance, candidates, report).select()
+    with single_thread():
+        present = ModelSelection(capture, settings.appearance, candidates, report).select()
     chosen = replace(settings, appearance=present.model.applied(settings.appearance))
     if "samples" not in settings.selection:
-        enough = enough_samples(capture, chosen.appearance, present.solution, settings.light_frames, settings.sizes)
+        with single_thread():
+            enough = enough_samples(capture, chosen.appearance, present.solution, settings.light_frames, settings.sizes)
         chosen = replace(chosen, light_frames=enough.frames, sizes=enough.sizes)
         context.note(f"model selection: {enough.told}")
     if "maps" not in settings.selection:

@@ -3,7 +3,7 @@ import threading
 import pytest
 import torch
 
-from shared.compute.threads import share_out
+from shared.compute.threads import share_out, single_thread, thread_count
 
 
 @pytest.fixture(params=[1, 2, 5])
@@ -40,3 +40,16 @@ def test_what_a_piece_raises_reaches_the_caller(threads):
 
     with pytest.raises(ValueError, match="seven"):
         share_out(20, work)
+
+
+def test_a_single_thread_is_kept_to_and_the_count_comes_back():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        with pytest.raises(ValueError), single_thread():
+            assert torch.get_num_threads() == thread_count() == 1
+            assert len(set(share_out(20, lambda _: threading.get_ident()))) == 1
+            raise ValueError
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
