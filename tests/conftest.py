@@ -84,12 +84,10 @@ def forget_leaks_of_openimageio():
 @pytest.fixture(scope="module")
 def one_thread():
     """Matrices this small are slower on several threads, much so beside other work."""
-    import torch
+    from shared.compute.threads import single_thread
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+    with single_thread():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -81,12 +81,13 @@ def select(
     candidates = allowed_candidates(settings.appearance, settings.selection)
     with single_thread():
         present = ModelSelection(capture, settings.appearance, candidates, report).select()
-    chosen = replace(settings, appearance=present.model.applied(settings.appearance))
-    if "samples" not in settings.selection:
-        with single_thread():
-            enough = enough_samples(capture, chosen.appearance, present.solution, settings.light_frames, settings.sizes)
-        chosen = replace(chosen, light_frames=enough.frames, sizes=enough.sizes)
-        context.note(f"model selection: {enough.told}")
+        chosen = replace(settings, appearance=present.model.applied(settings.appearance))
+        if "samples" not in settings.selection:
+            enough = enough_samples(
+                capture, chosen.appearance, present.solution, settings.light_frames, settings.sizes
+            )
+            chosen = replace(chosen, light_frames=enough.frames, sizes=enough.sizes)
+            context.note(f"model selection: {enough.told}")
     if "maps" not in settings.selection:
         chosen = replace(chosen, map_size=fitting_map_size(surface, views, settings.map_size))
     lit = LitSurface.of(surface, some_views(views, chosen, chosen.light_frames), chosen, chart, context)

@@ -14,7 +14,7 @@ CPU seconds of one thread: on a machine that others use too, the clock on the wa
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -100,6 +100,11 @@ def held_out_errors(views: Views, frame_errors: np.ndarray, settings: InverseSet
     return {str(number): float(error) for number, error in zip(numbers[~fitted], frame_errors[~fitted], strict=True)}
 
 
+def mean_error(row: dict, frames: Iterable[str]) -> float:
+    """Of a candidate's row, over some of the frames that judged it."""
+    return float(np.mean([row["held_out_frames"][frame] for frame in frames]))
+
+
 def compare(rows: Sequence[dict]) -> list[dict]:
     """Per clip: the best fixed candidate, and error and seconds of model selection relative to its, on the frames that
     all of them were judged by."""
@@ -113,13 +118,12 @@ def compare(rows: Sequence[dict]) -> list[dict]:
             if not common:
                 print(f"{clip}: no frame was held out from all candidates, so that they are not compared")
                 continue
-            own_error, *errors = (np.mean([row["held_out_frames"][name] for name in common]) for row in (auto, *fixed))
-            best = fixed[int(np.argmin(errors))]
+            best = min(fixed, key=lambda row: mean_error(row, common))
             result.append({
                 "clip": clip,
                 "best_fixed": f"{best['candidate']}, {best['mesh']}",
                 "auto": ", ".join(f"{key} {auto[key]}" for key in ("light", "chosen")),
-                "error_ratio": float(own_error / min(errors)),
+                "error_ratio": mean_error(auto, common) / mean_error(best, common),
                 "time_ratio": auto["cpu_s"] / best["cpu_s"],
             })
     return result
