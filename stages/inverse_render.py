@@ -71,7 +71,7 @@ PUBLISHED = ParameterGroup(
 
 STAGE = Stage(
     name="inverse_render",
-    version=46,
+    version=47,
     help="Light, shape, albedo, specular intensity and roughness from the whole clip.",
     inputs=("sample_frames", "track_landmarks", "init_albedo"),
     joins=("sample_frames", "track_landmarks", "init_albedo"),
@@ -126,8 +126,8 @@ STAGE = Stage(
         Parameter("roughness", float, 0.45, "Roughness to start from.", "", 0.1, 0.7),
         Parameter("fit_roughness", bool, True, "Fit the roughness; else it stays at its start."),
         Parameter("local_roughness", bool, True, "Let roughness vary over the skin where held-out frames gain by it."),
-        Parameter("specular_prior", float, 0.7, "Expected specular intensity of skin; index of refraction 1.4: 0.7.",
-                  "", 0.01, 2.0),
+        Parameter("specular_prior", float, 0.84, "Expected specular intensity of skin; index of refraction 1.4: 0.7, "
+                  "1.45: 0.84, 1.5: 1.", "", 0.01, 2.0),
         Parameter("light_colour_sigma", float, 0.15, "Expected deviation of the light's log colour ratios from grey, "
                   "where `grey` in `subject.yaml` does not tell them.", "", 0.01, 2.0, former="white_light"),
         Parameter("skin_brightness_sigma", float, 0.2, "Expected deviation of the log albedo's brightness at large "

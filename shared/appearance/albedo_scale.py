@@ -4,19 +4,17 @@ whites of the eyes, a grey place or a colour chart where they are in view.
 Twice the light on half the albedo gives the same diffuse picture. Three statements fix the factor, each a normal
 distribution over logarithms, and the whites of the eyes (eye_whites) and a chart (chart_scale) are others:
 
-- skin's luminance: log Y is normal with the median and the spread of reference skins of all tones;
-- skin's chroma lies on the locus of measured skins: log R/G and log B/G are linear in log Y, sigma as found there;
+- skin's luminance: log Y is normal about the median of measured people with the spread of all tones;
+- skin's chroma lies on the locus of measured skins: log R/G and log B/G are linear in log Y, sigma as found there
+  (measured_skin);
 - the light on the skin is white after the camera's own white balance: log R/G and log B/G ~ N(0, 0.15); or has the
   tint that a grey place shows (light_tint), where one is named.
 
-A fourth only keeps the skin's brightest places from returning more than the lightest reference skin.
+A fourth only keeps the skin's brightest places from returning more than any skin does.
 
 With u [3] the log of the mean irradiance on the skin and y [3] the log of the mean radiance that it returns, albedo is
 exp(y - u) and all of it is one quadratic in u, but for the fourth and for highlights. Steps take the most likely
 factor; the solution has the one that is expected in the mean (fit.at_mean_scale).
-
-References: skin I to VI of the Physically Based database (physicallybased.info, CC0), the same that OpenPBR viewers
-offer; ColorChecker patches "light skin" and "dark skin" (sRGB values of X-Rite, November 2014).
 """
 
 from __future__ import annotations
@@ -32,27 +30,18 @@ from scipy.stats import norm
 from scipy.stats.qmc import Sobol
 
 from shared.appearance.light_tint import LightTint
+from shared.appearance.measured_skin import (
+    BRIGHTEST_ALBEDO,
+    LUMINANCE_SIGMA,
+    TYPICAL_SKIN,
+    SkinLocus,
+    fit_skin_locus,
+)
 from shared.imaging.color import LUMINANCE
 
-REFERENCE_SKINS = np.array(
-    [
-        [0.847, 0.638, 0.552],
-        [0.799, 0.485, 0.347],
-        [0.623, 0.433, 0.343],
-        [0.436, 0.227, 0.131],
-        [0.283, 0.148, 0.079],
-        [0.090, 0.050, 0.020],
-        [0.539, 0.305, 0.223],
-        [0.171, 0.084, 0.058],
-    ]
-)
-"""Linear Rec.709 reflectance of reference skins, light to dark, then the two chart patches."""
-
-LUMINANCE_SIGMA = float(np.std(np.log(REFERENCE_SKINS @ LUMINANCE), ddof=1))
-"""Of the reference skins' log luminance: 0.87. Anything narrower darkens the fair and lightens the dark."""
 WHITE_SIGMA = 0.15
 BRIGHTEST, BRIGHTEST_SIGMA = 0.95, 0.05
-"""The quantile of the skin's albedo that no reference skin's exceeds, and by how much, in the logarithm, it may."""
+"""The quantile of the skin's albedo that BRIGHTEST_ALBEDO bounds, and how far beyond, in the logarithm, it may lie."""
 HIGHLIGHT_SIGMA = 0.08
 """Relative standard deviation of a specular intensity that the clip shows."""
 POINTS, PROPOSAL_WIDTH = 2048, 1.5
@@ -100,28 +89,6 @@ class ResolvedScale(NamedTuple):
         }
 
 
-@dataclass(frozen=True)
-class SkinLocus:
-    """log R/G and log B/G of skin: offset + slope * (log Y - mean_log_luminance), each [2], spread sigma [2]."""
-
-    mean_log_luminance: float
-    offset: np.ndarray
-    slope: np.ndarray
-    sigma: np.ndarray
-
-
-def fit_skin_locus(skins: np.ndarray = REFERENCE_SKINS) -> SkinLocus:
-    """Least-squares line through reference skins [N, 3]; the spread is the residual's, unbiased."""
-    logs = np.log(skins)
-    luminance = np.log(skins @ LUMINANCE)
-    mean = float(np.median(luminance))
-    chroma = logs[:, [0, 2]] - logs[:, [1]]
-    design = np.stack([np.ones_like(luminance), luminance - mean], axis=1)
-    (offset, slope), *_ = np.linalg.lstsq(design, chroma, rcond=None)
-    residual = chroma - design @ np.stack([offset, slope])
-    return SkinLocus(mean, offset, slope, np.sqrt((residual**2).sum(0) / (len(skins) - 2)))
-
-
 def scale_prior(
     log_radiance: np.ndarray,
     white_sigma: float = WHITE_SIGMA,
@@ -136,9 +103,8 @@ def scale_prior(
     Luminance enters linearised: d log Y = sum_c share_c d log a_c, with the shares of a typical skin.
     """
     locus = locus or fit_skin_locus()
-    typical = np.median(REFERENCE_SKINS, axis=0)
-    share = LUMINANCE * typical / (LUMINANCE @ typical)
-    constant = float(np.log(LUMINANCE @ typical) - share @ np.log(typical))
+    share = LUMINANCE * TYPICAL_SKIN / (LUMINANCE @ TYPICAL_SKIN)
+    constant = float(np.log(LUMINANCE @ TYPICAL_SKIN) - share @ np.log(TYPICAL_SKIN))
     ratio = np.array([[1.0, -1.0, 0.0], [0.0, -1.0, 1.0]])
     # Rows act on log albedo q = y - u: value = row @ q + const.
     rows, targets, sigmas = [share], [locus.mean_log_luminance - constant], [LUMINANCE_SIGMA]
@@ -225,10 +191,10 @@ def resolve_scale(
     def too_bright(x: np.ndarray) -> np.ndarray:
         if log_brightest is None:
             return np.zeros((*x.shape[:-1], 3))
-        return np.maximum(log_brightest - x[..., :3] - np.log(REFERENCE_SKINS.max()), 0.0) / BRIGHTEST_SIGMA
+        return np.maximum(log_brightest - x[..., :3] - np.log(BRIGHTEST_ALBEDO), 0.0) / BRIGHTEST_SIGMA
 
     if highlights is None:
-        # The reference skins keep to the bound by themselves: it tells nothing new of what they alone expect. But where
+        # Measured skins keep to the bound by themselves: it tells nothing new of what they alone expect. But where
         # the mode lies on it, its curvature is not what is known.
         mode = least_squares(lambda x: np.concatenate([on_skin(x), too_bright(x)]), alone, method="lm").x
         if log_brightest is None:

@@ -3,7 +3,9 @@
 The white of an eye is nearly neutral and about as bright in all people, while skin is not: where a clip shows it, its
 albedo under the light as it was solved says by which factor that light is off. The white is narrow and lies in the
 lids' shadow, beside lashes and under tears: only samples well within the lids and beyond the iris count, each under the
-light that reaches its place, the median of them, and with the deviation that eyes of known albedo have.
+light that reaches its place, the median of them, and with the deviation that eyes of known albedo have. Beside dark
+skin it is often burnt out. What is not would be its shaded part: so clipped samples count as brighter than any other,
+and where the median is among them nothing is said.
 """
 
 from __future__ import annotations
@@ -59,7 +61,7 @@ class WhitesSeen:
         self.places = Points(np.concatenate(positions), np.concatenate([directions, directions]))
         shape = len(self.places), len(views)
         self._colours, self._weight = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
-        self._towards = np.zeros((*shape, 3), np.float32)
+        self._saturation, self._towards = np.zeros((*shape, 3), np.int8), np.zeros((*shape, 3), np.float32)
 
     def look(self, f: int, picture: Picture) -> None:
         """Frame f of the views."""
@@ -81,9 +83,9 @@ class WhitesSeen:
         rows = rows[~self._scene.occluded(start, towards[rows])]
         if not len(rows):
             return
-        clean = (sample_saturation(picture.saturation, pixels[rows]) == 0).all(1)
+        self._saturation[rows, f] = sample_saturation(picture.saturation, pixels[rows])
         self._colours[rows, f] = sample_colours(picture, pixels[rows])
-        self._weight[rows, f] = np.square(cosine[rows]) * clean
+        self._weight[rows, f] = np.square(cosine[rows]) * (self._saturation[rows, f] >= 0).all(1)
 
     def looked_at(self, pictures: Iterable[Picture]) -> Iterator[Picture]:
         """Pictures of all frames in order, handed on."""
@@ -96,30 +98,34 @@ class WhitesSeen:
         do."""
         rows = np.nonzero((self._weight[:, fitted] > 0.0).sum(1) >= LEAST_FRAMES)[0]
         rows = rows if len(rows) >= LEAST_PLACES else rows[:0]
-        bounds = np.zeros((len(rows), *self._towards.shape[1:]), np.int8)
-        return rows, Samples(self._colours[rows], self._weight[rows] * fitted, bounds, self._towards[rows])
+        weight = self._weight[rows] * fitted
+        return rows, Samples(self._colours[rows], weight, self._saturation[rows], self._towards[rows])
 
 
-def whites_statement(samples: Samples, irradiance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def whites_statement(samples: Samples, irradiance: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """How much brighter the light should be for the whites to have their usual albedo: log factor [3], and its
-    covariance [3, 3]. samples [P, F] of them under irradiance over pi [3, P, F].
+    covariance [3, 3]; None where too many are burnt out. samples [P, F] of them under irradiance over pi [3, P, F].
 
     Their albedo is the slope of radiance over irradiance with the least absolute deviations, which is the median of the
     ratios weighted by the irradiance: what lies in shadow says little. Errors of shading are shared by neighbours: all
     samples count as few.
     """
-    lower, albedo, upper = np.log(albedo_of_whites(samples, irradiance, (0.25, 0.5, 0.75)))
-    spread = ROBUST_SCALE * 0.5 * float((upper - lower).mean())
+    lower, albedo = np.log(albedo_of_whites(samples, irradiance, (0.25, 0.5)))
+    if not np.isfinite(albedo).all():
+        return None
+    spread = ROBUST_SCALE * float((albedo - lower).mean())
     level = LEVEL_SIGMA**2 + spread**2 / INDEPENDENT
     return albedo - np.log(USUAL_ALBEDO), level + 0.5 * TINT_SIGMA**2 * np.eye(3)
 
 
 def albedo_of_whites(samples: Samples, irradiance: np.ndarray, shares: Sequence[float]) -> np.ndarray:
-    """[n, 3]: quantiles, shares [n], of the ratio of radiance and irradiance over pi [3, P, F], weighted by it."""
+    """[n, 3]: quantiles, shares [n], of the ratio of radiance and irradiance over pi [3, P, F], weighted by it; a
+    clipped ratio is greater than any: inf."""
     found = np.empty((len(shares), 3))
     for c, light in enumerate(irradiance):
         weight = (samples.weight * light).ravel()
         ratio = samples.colours[..., c].ravel() / np.maximum(light.ravel(), 1e-6)
+        ratio[samples.saturation[..., c].ravel() > 0] = np.inf
         order = np.argsort(ratio)
         total = np.cumsum(weight[order])
         found[:, c] = ratio[order[np.searchsorted(total, np.array(shares) * total[-1])]]

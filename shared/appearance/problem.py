@@ -30,6 +30,7 @@ from shared.appearance.eye_whites import whites_statement
 from shared.appearance.light import FrameLight, LightPriors
 from shared.appearance.light_models import LightModel, make_light_model
 from shared.appearance.light_tint import LightTint
+from shared.appearance.measured_skin import SURFACE_INTENSITY, SURFACE_SPREAD
 from shared.appearance.observations import Capture
 from shared.appearance.sample_errors import SampleErrors
 from shared.appearance.skin_prior import SkinPrior, SkinVariation
@@ -73,7 +74,7 @@ class AppearanceSettings:
     roughness: float = 0.45
     fit_roughness: bool = True
     local_roughness: bool = True
-    specular_prior: tuple[float, float] = (0.7, 0.25)
+    specular_prior: tuple[float, float] = (SURFACE_INTENSITY, SURFACE_SPREAD)
     precision: tuple[int, float] = (60, 0.0005)
     coarse_points: int = 1000
 
@@ -368,7 +369,7 @@ class AppearanceProblem:
 
     def said_by_whites(self, state: AppearanceState) -> tuple[np.ndarray, np.ndarray] | None:
         """The log factor [3] on the state's light that the whites of the eyes ask for, and its covariance [3, 3]; None
-        where the clip shows too little of them."""
+        where the clip shows too little of them, or too much of that burnt out."""
         if self.whites is None:
             return None
         return whites_statement(self.whites.capture.samples, self.whites.irradiance(state))

@@ -1,7 +1,9 @@
 """How far a model of the clip is from its samples: their noise, their weights and what they count as evidence.
 
 Weights are robust (Cauchy, by reweighting), and clipped or crushed samples only push when the model violates what they
-say (censored data).
+say (censored data). A sample's variance in a fit is that of the radiance the model expects, not of the sample: else
+what is brighter than expected weighs less than what is darker, and highlights of dark skin come out too weak
+(quasi-likelihood [Wedderburn1974]).
 """
 
 from __future__ import annotations
@@ -28,10 +30,11 @@ class SampleErrors:
 
     colours [3, P, F] linear; saturation [3, P, F] as in Samples; view_weight [1, P, F]: by how well a frame sees a
     point, 0: not at all; precision [3, P, F]: inverse variance of a sample; fitted [F] 1, or 0 for frames held out;
-    light_frames: of each light, the indices of its frames; independent: how many of each light's samples count as
-    independent evidence against the priors; reliability [3, P, F] or [1, 1, 1]: how much samples of several lights
-    count against each other, 1 in full, contained in the precision; light_shares: by how much the prior of each light
-    steps back for it, empty: not at all; reduced_chi_square: variance of the residuals over the assumed noise's.
+    light_frames: of each light, the indices of its frames; noise: see of; independent: how many of each light's
+    samples count as independent evidence against the priors; reliability [3, P, F] or [1, 1, 1]: how much samples of
+    several lights count against each other, 1 in full, contained in the precision; light_shares: by how much the prior
+    of each light steps back for it, empty: not at all; reduced_chi_square: variance of the residuals over the assumed
+    noise's.
     """
 
     colours: torch.Tensor
@@ -40,6 +43,7 @@ class SampleErrors:
     precision: torch.Tensor
     fitted: torch.Tensor
     light_frames: list[np.ndarray]
+    noise: tuple[float, float]
     independent: float
     reliability: torch.Tensor = field(default_factory=lambda: torch.ones(1, 1, 1))
     light_shares: tuple[float, ...] = ()
@@ -65,6 +69,7 @@ class SampleErrors:
             precision=1.0 / (sigma * sigma),
             fitted=torch.from_numpy(fitted.astype(np.float32)),
             light_frames=light_frames,
+            noise=noise,
             independent=independent,
         )
 
@@ -77,13 +82,17 @@ class SampleErrors:
         )
 
     def weights(self, model: torch.Tensor | None) -> torch.Tensor:
-        """[3, P, F] inverse variances under a model [3, P, F]: robust, and zero where a censored sample's bound is
-        inactive; without a model, of all samples that are not censored."""
+        """[3, P, F] inverse variances as a model [3, P, F] expects them: robust, and zero where a censored sample's
+        bound is inactive; without a model, of all samples that are not censored."""
         weight = self.view_weight * self.precision
         if model is None:
             return weight * (self.saturation == 0)
+        absolute, relative = self.noise
+        of_sample, of_model = (absolute + relative * one for one in (self.colours, model.clamp_min(0.0)))
+        expected = (of_sample / of_model).square()
         error, inactive = self.errors(model)
-        return weight * (~inactive) / (1.0 + error / (CAUCHY * self.spread(error, inactive)))
+        error = error * expected
+        return weight * expected * (~inactive) / (1.0 + error / (CAUCHY * self.spread(error, inactive)))
 
     def errors(self, model: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Squared errors of a model [3, P, F] over the assumed noise's variance, and where a censored sample's bound

@@ -8,6 +8,7 @@ import numpy as np
 
 from shared.appearance.light import LightPriors
 from shared.appearance.light_tint import LightTint
+from shared.appearance.measured_skin import SURFACE_SPREAD
 from shared.appearance.problem import AppearanceSettings
 from shared.appearance.skin_prior import SkinVariation
 from shared.contract.job import Parameters
@@ -23,8 +24,6 @@ from shared.selection.candidates import PARTS
 from shared.shape.gauss_newton import ShapeSettings
 
 LAMP_DISTANCES = {"auto": None, "far": FAR}
-SPECULAR_SPREAD = 0.25
-"""Standard deviation of the logarithm of people's mean specular intensity about the expected one."""
 
 
 def read_settings(
@@ -47,7 +46,7 @@ def read_settings(
         roughness=params.roughness,
         fit_roughness=params.fit_roughness,
         local_roughness=params.local_roughness,
-        specular_prior=(params.specular_prior, SPECULAR_SPREAD),
+        specular_prior=(params.specular_prior, SURFACE_SPREAD),
         coarse_points=params.coarse_points,
     )
     contour = {} if params.silhouette else {"contour": None}

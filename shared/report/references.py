@@ -49,6 +49,9 @@ REFERENCES = {
     "Dempster1977":
         "Dempster, Laird, Rubin, Maximum Likelihood from Incomplete Data via the EM Algorithm. Journal of the Royal "
         "Statistical Society B 39, 1977.",
+    "Ding2006":
+        "Ding et al., Refractive Indices of Human Skin Tissues at Eight Wavelengths and Estimated Dispersion Relations "
+        "Between 300 and 1600 nm. Physics in Medicine and Biology 51, 2006.",
     "Duff2017":
         "Duff et al., Building an Orthonormal Basis, Revisited. Journal of Computer Graphics Techniques 6, 2017.",
     "Dupuy2023": "Dupuy, Benyoub, Sampling Visible GGX Normals with Spherical Caps. Computer Graphics Forum 42, 2023.",
@@ -120,6 +123,9 @@ REFERENCES = {
     "Liang1986":
         "Liang, Zeger, Longitudinal Data Analysis Using Generalized Linear Models. Biometrika 73, 1986.",
     "Loop1987": "Loop, Smooth Subdivision Surfaces Based on Triangles. Master's thesis, University of Utah, 1987.",
+    "Lu2025":
+        "Lu, Xiao, Pointer et al., The International Skin Spectra Archive (ISSA): A Multicultural Human Skin Phenotype "
+        "and Colour Spectra Collection. Scientific Data 12, 2025.",
     "Mackay1992": "MacKay, Bayesian Interpolation. Neural Computation 4 (3), 1992.",
     "Mccamy1976":
         "McCamy, Marcus, Davidson, A Color-Rendition Chart. Journal of Applied Photographic Engineering 2, 1976.",
@@ -192,5 +198,13 @@ REFERENCES = {
         "Wang et al., Image Quality Assessment: From Error Visibility to Structural Similarity. IEEE Transactions on "
         "Image Processing 13, 2004.",
     "Wang2009": "Wang et al., All-Frequency Rendering of Dynamic, Spatially-Varying Reflectance. SIGGRAPH Asia 2009.",
+    "Wedderburn1974":
+        "Wedderburn, Quasi-Likelihood Functions, Generalized Linear Models, and the Gauss-Newton Method. Biometrika "
+        "61, 1974.",
+    "Weyrich2006":
+        "Weyrich et al., Analysis of Human Faces Using a Measurement-Based Skin Reflectance Model. SIGGRAPH 2006.",
     "Xu2025": "Xu et al., Monocular Facial Appearance Capture in the Wild. ICCV 2025.",
+    "Yoshida2013":
+        "Yoshida et al., Application of the Critical Angle Method to Refractive Index Measurement of Human Skin In "
+        "Vivo Under Partial Contact. Journal of Biomedical Optics 18, 2013.",
 }

@@ -28,7 +28,9 @@ from shared.appearance.projection import (
     measure_highlights,
     project_off_albedo,
 )
+from shared.appearance.sample_errors import SampleErrors
 from shared.geometry.transforms import places_in_world
+from shared.imaging.image_sampling import Samples
 from shared.rendering.envmap import cube_directions
 from shared.rendering.lobes import SpecularTransfer, specular_reflection
 from shared.rendering.near_lamp import NearLamp, SeenLamp
@@ -185,6 +187,22 @@ def test_highlights_are_joint_least_squares(truth):
         expected = np.linalg.lstsq(design * root[:, None], right, rcond=None)[0][-1]
         assert found[c] == pytest.approx(expected, rel=0.01)
     assert np.allclose(found, SPECULAR, rtol=0.1)
+
+
+def test_a_sample_weighs_what_its_expected_radiance_says():
+    """Radiances that scatter by a fifth about a model's: its scale comes out as 1. By the samples' own brightness, what
+    is darker than expected would weigh more: 6 % less."""
+    model = torch.linspace(0.1, 0.9, 4000).reshape(1, 100, 40).expand(3, -1, -1).contiguous()
+    scatter = torch.from_numpy(np.random.default_rng(3).normal(size=model.shape).astype(np.float32))
+    colours = np.moveaxis((model * (1.0 + 0.2 * scatter)).numpy(), 0, -1)
+    samples = Samples(colours, np.ones((100, 40), np.float32), np.zeros(colours.shape, np.int8), np.zeros((100, 40, 3)))
+    errors = SampleErrors.of(samples, np.ones(40, bool), [np.arange(40)], (0.006, 0.03), 5000.0)
+
+    def scale(weight):
+        return float((weight * model * errors.colours).sum() / (weight * model * model).sum())
+
+    assert abs(scale(errors.weights(model)) - 1.0) < 0.01
+    assert scale(errors.view_weight * errors.precision) < 0.94
 
 
 def test_clipped_samples_do_not_bias(one_thread):

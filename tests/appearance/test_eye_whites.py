@@ -7,7 +7,7 @@ import pytest
 from field_check import below, field_faults
 from shapes import FACING, two_balls
 
-from shared.appearance.albedo_scale import REFERENCE_SKINS, Highlights, resolve_scale
+from shared.appearance.albedo_scale import Highlights, resolve_scale
 from shared.appearance.chart_scale import describe_scale
 from shared.appearance.eye_whites import (
     LEAST_FRAMES,
@@ -18,6 +18,7 @@ from shared.appearance.eye_whites import (
     describe_whites,
     whites_statement,
 )
+from shared.appearance.measured_skin import TYPICAL_SKIN
 from shared.contract.records import SOLVE
 from shared.geometry.eyeballs import IRIS_MM, gaze_rotation
 from shared.geometry.transforms import camera_centres, project, rigid
@@ -94,12 +95,36 @@ def test_places_lie_in_the_opening_by_the_margin():
     assert (within * depth / FOCAL_LENGTH).min() > WITHIN_MM
 
 
-@pytest.mark.parametrize("why", ["shut", "narrow", "clipped", "held out"])
+@pytest.mark.parametrize("why", ["shut", "narrow", "held out"])
 def test_what_shows_no_white_says_nothing(why):
     gazes = np.full_like(GAZES, np.nan) if why == "shut" else GAZES
-    whites = seen_in(gazes, 1.0 if why == "narrow" else 4.5, clipped=why == "clipped")
+    whites = seen_in(gazes, 1.0 if why == "narrow" else 4.5)
     fitted = np.arange(FRAMES) < (LEAST_FRAMES - 1 if why == "held out" else FRAMES)
     assert not len(whites.samples(fitted)[0])
+
+
+def test_whites_that_are_burnt_out_say_nothing():
+    rows, samples = seen_in(GAZES, 4.5, clipped=True).samples(np.ones(FRAMES, bool))
+    assert len(rows) > 24 and (samples.saturation[samples.weight > 0] == 1).all()
+    assert whites_statement(samples, np.ones((3, *samples.weight.shape))) is None
+
+
+@pytest.mark.parametrize("clip", [0.55, 0.45])
+def test_what_burns_out_does_not_leave_the_shaded_part_to_speak(clip):
+    """Albedo about USUAL_ALBEDO, of which all above clip is burnt out: the median is the same while it is not."""
+    scatter = 0.1 * np.random.default_rng(2).normal(size=(40, 12))
+    irradiance = np.ones((3, 40, 12))
+    samples = samples_of(np.full(3, USUAL_ALBEDO), irradiance, scatter)
+    full, _ = whites_statement(samples, irradiance)
+    burnt = samples.colours > clip
+    cut = Samples(np.minimum(samples.colours, clip), samples.weight, burnt.astype(np.int8), samples.towards_camera)
+    said = whites_statement(cut, irradiance)
+    if clip < USUAL_ALBEDO:
+        assert said is None
+    else:
+        np.testing.assert_array_equal(said[0], full)
+        kept = samples.colours[~burnt.any(-1)]
+        assert np.median(kept) < 0.94 * USUAL_ALBEDO
 
 
 def samples_of(albedo: np.ndarray, irradiance: np.ndarray, error: np.ndarray) -> Samples:
@@ -135,7 +160,7 @@ def test_shadows_that_the_light_gets_wrong_say_little_and_scatter_makes_unsure()
 
 
 def test_whites_move_the_scale_as_far_as_they_are_sure():
-    skin, wanted = np.log(np.median(REFERENCE_SKINS, axis=0)), np.full(3, -0.8)
+    skin, wanted = np.log(TYPICAL_SKIN), np.full(3, -0.8)
     alone, *_ = resolve_scale(skin, np.zeros(3), None, (0.7, 0.25))
 
     def with_whites(sigma: float) -> np.ndarray:
@@ -148,7 +173,7 @@ def test_whites_move_the_scale_as_far_as_they_are_sure():
 
 def test_wide_highlights_do_not_darken_skin_beside_bright_whites():
     """Highlights that need twice their usual strength ask for twice the light; whites at their usual albedo do not."""
-    skin = np.log(np.median(REFERENCE_SKINS, axis=0))
+    skin = np.log(TYPICAL_SKIN)
     strong = Highlights(np.full(3, 1.4), np.full(3, 1e4), np.full(3, 5.0))
     whites = np.zeros(3), 0.33**2 + 0.5 * 0.15**2 * np.eye(3)
     without, *_ = resolve_scale(skin, np.zeros(3), strong, (0.7, 0.25))
@@ -159,7 +184,7 @@ def test_wide_highlights_do_not_darken_skin_beside_bright_whites():
 
 def test_highlights_that_contradict_the_whites_move_the_scale_by_little_at_a_time():
     """With two answers that are about as likely each step of the light would take the other."""
-    skin = np.log(np.median(REFERENCE_SKINS, axis=0))
+    skin = np.log(TYPICAL_SKIN)
     whites = np.full(3, -0.5), 0.33**2 + 0.5 * 0.15**2 * np.eye(3)
 
     def resolved(strength: float) -> float:

@@ -8,9 +8,7 @@ from scipy.stats import norm
 from shared.appearance.albedo_scale import (
     HIGHLIGHT_SIGMA,
     MODEL_ERROR,
-    REFERENCE_SKINS,
     Highlights,
-    fit_skin_locus,
     mean_of_density,
     most_likely_irradiance,
     resolve_scale,
@@ -18,6 +16,7 @@ from shared.appearance.albedo_scale import (
 from shared.appearance.chart_scale import describe_scale
 from shared.appearance.light import FrameLight, LightPriors, LogPrior, resample_light
 from shared.appearance.light_models import make_light_model, real_harmonics
+from shared.appearance.measured_skin import TYPICAL_SKIN, fit_skin_locus
 from shared.contract.records import SOLVE
 from shared.geometry.transforms import fibonacci_sphere, rotation_from_vector
 from shared.imaging.color import LUMINANCE
@@ -148,7 +147,7 @@ def test_light_models_find_their_own_light():
 def on_the_locus():
     """log albedo [3] of the skin that the priors like best: mean luminance (linearised as there), chroma to match."""
     locus = fit_skin_locus()
-    typical = np.median(REFERENCE_SKINS, axis=0)
+    typical = TYPICAL_SKIN
     share = LUMINANCE * typical / (LUMINANCE @ typical)
     constant = np.log(LUMINANCE @ typical) - share @ np.log(typical)
     matrix = np.array([share, [1.0, -1, 0], [0, -1.0, 1]])
@@ -285,15 +284,6 @@ def test_the_mean_of_a_bounded_density_is_that_of_the_truncated_normal():
     mean, found = mean_of_density(stated, lambda x: np.zeros(x.shape), middle)
     np.testing.assert_allclose(mean, middle, atol=1e-6)
     np.testing.assert_allclose(found, covariance, atol=5e-4)
-
-
-def test_skin_locus_runs_through_the_reference_skins():
-    locus = fit_skin_locus()
-    luminance = np.log(REFERENCE_SKINS @ LUMINANCE) - locus.mean_log_luminance
-    chroma = np.log(REFERENCE_SKINS[:, [0, 2]] / REFERENCE_SKINS[:, [1]])
-    residual = chroma - locus.offset - luminance[:, None] * locus.slope
-    assert np.allclose(residual.sum(0), 0.0, atol=1e-9) and np.allclose(luminance @ residual, 0.0, atol=1e-9)
-    assert (np.abs(residual) < 3.0 * locus.sigma).all()
 
 
 def test_frames_are_spread_and_held_out_evenly():

@@ -8,17 +8,18 @@ import pytest
 from field_check import below, field_faults
 from toy_capture import MATTE, make_truth
 
-from shared.appearance.albedo_scale import REFERENCE_SKINS, WHITE_SIGMA, most_likely_irradiance, resolve_scale
+from shared.appearance.albedo_scale import WHITE_SIGMA, most_likely_irradiance, resolve_scale
 from shared.appearance.chart_scale import describe_scale
 from shared.appearance.diagnostics import unlikely_colour
 from shared.appearance.fit import fit_appearance
 from shared.appearance.light_tint import GREY_SIGMA, LightTint
+from shared.appearance.measured_skin import TYPICAL_SKIN
 from shared.appearance.problem import AppearanceProblem
 from shared.contract.records import SOLVE
 from shared.inverse.clip_inputs import ClipInputs
 
 PRIOR = (0.7, 0.35)
-SKIN = np.log(np.median(REFERENCE_SKINS, axis=0))
+SKIN = np.log(TYPICAL_SKIN)
 TINT = np.array([0.45, 0.0, -0.5])
 SURE = LightTint((0.45, -0.5), (GREY_SIGMA, GREY_SIGMA))
 

@@ -1,8 +1,10 @@
 """Procedural skin: reflectance textures for the head model from a seed.
 
 Tone follows two pigments, melanin and haemoglobin, whose amounts vary over the face and absorb each colour channel
-differently (after [Tsumura2003]; the numbers here are chosen by eye). Patterns live in the head's 3D space, so UV seams
-do not show.
+differently (after [Tsumura2003]). What melanin absorbs is fitted to cheeks and foreheads that were measured
+(MEASURED_SKINS, rms 2 % over all tones and channels); from person to person skin is as red and as yellow as measured
+people of one lightness are. How pigments vary over a face is chosen by eye. Patterns live in the head's 3D space, so UV
+seams do not show.
 """
 
 from __future__ import annotations
@@ -20,9 +22,15 @@ from shared.imaging.value_noise import value_noise
 from tools.synthesis.head import Head
 from tools.synthesis.surface import Materials
 
-BARE_SKIN = np.array([0.86, 0.75, 0.66])
-MELANIN_ABSORPTION = np.array([0.55, 0.95, 1.5])
+BARE_SKIN = np.array([0.716, 0.698, 0.599])
+ABOVE_PIGMENTS = 0.019
+"""Linear reflectance that no pigment takes away: the darkest skins are nearly grey."""
+MELANIN_ABSORPTION = np.array([1.721, 2.445, 3.847])
 HAEMOGLOBIN_ABSORPTION = np.array([0.13, 0.78, 0.52])
+HAEMOGLOBIN, HAEMOGLOBIN_SPREAD = 0.55, 0.12
+"""Of a face, and its standard deviation between people: 0.08 in log R/G, that of measured faces of one lightness."""
+YELLOW_SPREAD = 0.1
+"""Standard deviation between people of what further pigments absorb in blue, from measured b* of one lightness."""
 MASK_SEGMENTS = ("forehead", "lids", "nose", "cheek_left", "cheek_right", "upper_lip_skin", "lips", "chin")
 COLLAR_Y_MM, COLLAR_SLOPE = -163.0, -0.5
 CLOTH_ALBEDO = (0.07, 0.085, 0.11)
@@ -32,10 +40,10 @@ LABEL_MM = 2.0
 """Standard deviation over which hair counts as covering the skin between its strands."""
 # Amounts added per region: melanin, haemoglobin, specular intensity, roughness.
 REGIONS = {
-    "lips": (0.10, 0.75, 0.22, -0.11), "lids": (0.10, 0.16, 0.05, -0.02), "ears": (0.0, 0.32, 0.0, 0.02),
-    "nose": (0.0, 0.14, 0.20, -0.07), "forehead": (0.02, 0.0, 0.10, -0.04), "chin": (0.0, 0.06, 0.04, 0.0),
-    "scalp": (0.0, 0.0, -0.12, 0.05), "neck": (0.05, 0.03, -0.08, 0.03), "inner_mouth": (0.5, 1.3, 0.0, -0.1),
-    "eye_sockets": (0.3, 0.8, 0.0, 0.0),
+    "lips": (0.04, 0.75, 0.22, -0.11), "lids": (0.04, 0.16, 0.05, -0.02), "ears": (0.0, 0.32, 0.0, 0.02),
+    "nose": (0.0, 0.14, 0.20, -0.07), "forehead": (0.008, 0.0, 0.10, -0.04), "chin": (0.0, 0.06, 0.04, 0.0),
+    "scalp": (0.0, 0.0, -0.12, 0.05), "neck": (0.02, 0.03, -0.08, 0.03), "inner_mouth": (0.2, 1.3, 0.0, -0.1),
+    "eye_sockets": (0.12, 0.8, 0.0, 0.0),
 }
 BLUSH = {50: 20.0, 280: 20.0, 4: 11.0}
 """Landmarks on which the skin is redder, with the radius in mm: both cheeks and the tip of the nose."""
@@ -43,8 +51,8 @@ BLUSH = {50: 20.0, 280: 20.0, 4: 11.0}
 
 @dataclass(frozen=True)
 class Complexion:
-    """tone: amount of melanin, about 0.15 (fair) to 1.8 (dark); freckles, stubble, hair: 0 to 1; hair and iris
-    colours: linear albedo."""
+    """tone: amount of melanin, 0.15 as the lightest measured faces to 1.6 as the darkest; freckles, stubble, hair: 0 to
+    1; hair and iris colours: linear albedo."""
 
     tone: float = 0.35
     freckles: float = 0.5
@@ -52,6 +60,12 @@ class Complexion:
     hair: float = 0.9
     hair_colour: tuple[float, float, float] = (0.055, 0.036, 0.025)
     iris_colour: tuple[float, float, float] = (0.075, 0.10, 0.12)
+
+
+def skin_of(melanin: np.ndarray | float, haemoglobin: np.ndarray | float = HAEMOGLOBIN) -> np.ndarray:
+    """Linear albedo [..., 3] of skin with so much melanin and haemoglobin [...]."""
+    absorbed = np.multiply.outer(melanin, MELANIN_ABSORPTION) + np.multiply.outer(haemoglobin, HAEMOGLOBIN_ABSORPTION)
+    return ABOVE_PIGMENTS + (BARE_SKIN - ABOVE_PIGMENTS) * np.exp(-absorbed)
 
 
 class SkinPainter:
@@ -63,6 +77,7 @@ class SkinPainter:
     def __init__(self, head: Head, size: int, seed: int):
         self.size = size
         self._rng = np.random.default_rng([seed, 5])
+        self._ruddy, self._yellow = np.random.default_rng([seed, 9]).normal(size=2)
         self._head, mesh = head, head.mesh
         face, bary = rasterize_uv(mesh, size)
         empty = face < 0
@@ -88,8 +103,8 @@ class SkinPainter:
     def paint(self, complexion: Complexion, labelled: bool = False) -> Materials:
         """All textures; labelled: with labels."""
         melanin, haemoglobin, specular, roughness = self._amounts(complexion)
-        absorbed = melanin[..., None] * MELANIN_ABSORPTION + haemoglobin[..., None] * HAEMOGLOBIN_ABSORPTION
-        albedo = BARE_SKIN * np.exp(-absorbed)
+        albedo = skin_of(melanin, haemoglobin)
+        albedo[..., 2] *= np.exp(-YELLOW_SPREAD * self._yellow)
         covered, brows = self._hair(complexion)
         hair = np.clip(np.maximum(covered, brows), 0, 1)
         albedo = albedo * (1 - hair[..., None]) + np.array(complexion.hair_colour) * hair[..., None]
@@ -122,9 +137,10 @@ class SkinPainter:
     def _amounts(self, complexion: Complexion) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Melanin, haemoglobin, specular intensity and roughness of bare skin, each [size, size]."""
         tone = complexion.tone
-        melanin = tone * (1 + 0.10 * self.noise(30) + 0.06 * self.noise(7) + 0.05 * self.noise(1.6))
+        melanin = tone * (1 + 0.04 * self.noise(30) + 0.024 * self.noise(7) + 0.02 * self.noise(1.6))
         melanin += complexion.freckles * self._freckles() + self._moles()
-        haemoglobin = 0.55 + 0.07 * self.noise(16) + 0.06 * self.noise(5) + 0.05 * self.noise(2)
+        haemoglobin = HAEMOGLOBIN + HAEMOGLOBIN_SPREAD * self._ruddy
+        haemoglobin = haemoglobin + 0.07 * self.noise(16) + 0.06 * self.noise(5) + 0.05 * self.noise(2)
         specular = 0.72 + 0.06 * self.noise(14) + 0.05 * self.noise(2.5)
         roughness = 0.45 + 0.015 * self.noise(20) + 0.015 * self.noise(3)
         for landmark, radius in BLUSH.items():
@@ -142,7 +158,7 @@ class SkinPainter:
         """Small dark spots where a coarse pattern allows them, mostly on nose and cheeks."""
         where = self.region("nose", "cheek_left", "cheek_right", "forehead", softness_mm=6) * 0.8 + 0.2
         spots = np.clip(self.noise(2.4) - 1.1, 0, 1) * np.clip(0.6 + 0.5 * self.noise(25), 0, 1)
-        return 0.55 * spots * where
+        return 0.22 * spots * where
 
     def _moles(self) -> np.ndarray:
         """A handful of single dark spots on cheeks, chin, forehead and neck."""
@@ -151,7 +167,7 @@ class SkinPainter:
         moles = np.zeros((self.size, self.size))
         for index in self._rng.integers(len(places), size=7):
             distance = np.linalg.norm(self.place - places[index], axis=-1)
-            moles += self._rng.uniform(0.4, 1.1) / (1 + (distance / self._rng.uniform(0.6, 1.3)) ** 6)
+            moles += self._rng.uniform(0.16, 0.44) / (1 + (distance / self._rng.uniform(0.6, 1.3)) ** 6)
         return moles
 
     def _hair(self, complexion: Complexion) -> tuple[np.ndarray, np.ndarray]:

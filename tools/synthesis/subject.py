@@ -51,7 +51,7 @@ from tools.synthesis.light import ENVIRONMENTS, LampSphere, procedural_environme
 from tools.synthesis.lips import with_shut_lips
 from tools.synthesis.render import RenderQuality, Scene, render
 from tools.synthesis.scan import read_scan
-from tools.synthesis.skin import Complexion, SkinPainter
+from tools.synthesis.skin import Complexion, SkinPainter, skin_of
 from tools.synthesis.surface import Materials
 
 SENSOR_MM, FPS = 22.3, 25.0
@@ -290,7 +290,7 @@ def light_of(name: str, settings: SynthesisSettings) -> np.ndarray:
     solid_angle = np.sin(np.arccos(directions[..., 1])) * (np.pi / environment.shape[0]) ** 2
     cosine = np.clip(directions[..., 2], 0, 1)
     irradiance = (environment * (cosine * solid_angle)[..., None]).sum((0, 1)).mean()
-    skin_albedo = 0.52 * np.exp(-settings.tone)
+    skin_albedo = skin_of(settings.tone).mean()
     return (environment * (FACE_RADIANCE * np.pi / (irradiance * skin_albedo))).astype(np.float32)
 
 
@@ -334,7 +334,7 @@ def parse(arguments: list[str] | None) -> tuple[Path, SynthesisSettings, int]:
                         "or wandering over points of the room")
     parser.add_argument("--gaze-share", type=float, help="how far eyes turn to the camera that look there, 0 to 1")
     parser.add_argument("--blinks", dest="blinks_per_second", type=float, metavar="PER_SECOND", help="of living eyes")
-    parser.add_argument("--tone", type=float, help="melanin: 0.15 fair to 1.6 dark")
+    parser.add_argument("--tone", type=float, help="melanin: 0.15 as the lightest measured faces to 1.6 as the darkest")
     parser.add_argument("--light", choices=ENVIRONMENTS, help="the clip's light")
     parser.add_argument("--focal", dest="focal_mm", type=float, help="focal length, mm, on a sensor 22.3 mm wide")
     parser.add_argument("--yaw", dest="yaw_deg", type=float, help="how far the head turns to each side, degrees")
