@@ -1,5 +1,7 @@
 """Synthetic skin beside measured faces."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -15,7 +17,7 @@ from tools.synthesis.skin import (
     SkinPainter,
     skin_of,
 )
-from tools.synthesis.subject import head_model
+from tools.synthesis.subject import PRESETS, head_model, light_of
 
 
 @pytest.mark.parametrize("measured", MEASURED_SKINS, ids=[f"Y{skin @ LUMINANCE:.2f}" for skin in MEASURED_SKINS])
@@ -49,3 +51,16 @@ def test_a_painted_face_has_the_tone_that_is_asked_for(tone):
     assert np.abs(np.mean(ratios, axis=0)).max() < 0.15
     tint = np.array(ratios)[:, 0] - np.array(ratios)[:, 1]
     assert 0.02 < tint.std(ddof=1) < 0.16
+
+
+def test_dark_skin_is_exposed_for_by_half():
+    """What faces the light's middle: fair skin as bright as the default's, dark skin darker, but by half in stops."""
+    def brightness(tone):
+        settings = replace(PRESETS["tiny"], tone=tone)
+        return float(light_of("even", settings).mean() * skin_of(tone).mean())
+
+    usual = brightness(PRESETS["tiny"].tone)
+    assert brightness(0.15) == pytest.approx(usual, rel=1e-5)
+    darker = skin_of(1.6).mean() / skin_of(PRESETS["tiny"].tone).mean()
+    assert brightness(1.6) == pytest.approx(usual * np.sqrt(darker), rel=1e-5)
+    assert darker < 0.2

@@ -62,7 +62,8 @@ TOP_MARGIN_MM = 27.0
 WITH_CHART = 1.5
 """Width of a picture that holds a chart, relative to its height."""
 FACE_RADIANCE = 0.32
-"""Mean linear radiance of the face, seen from the front, to which the exposure is set."""
+"""Mean linear radiance of the face, seen from the front, to which the exposure is set. Skin darker than the default's
+is exposed for by half of that, in stops: it stays darker in the picture, and its highlights do not all burn out."""
 EXPOSURE_SIZE, EXPOSURE_VIEWS = 200, 3
 """Pictures by which the light is set so that a share of the face burns out: how large, how many."""
 LEAST_IRRADIANCE = 0.8
@@ -284,14 +285,15 @@ def head_model(level: int) -> HeadModel:
 
 
 def light_of(name: str, settings: SynthesisSettings) -> np.ndarray:
-    """The named environment, scaled so that skin that faces the camera has a radiance of FACE_RADIANCE."""
+    """The named environment, scaled so that skin that faces the camera is as bright as FACE_RADIANCE says."""
     environment = procedural_environment(name, settings.seed, settings.light_height)
     directions = latlong_directions(environment.shape[0])
     solid_angle = np.sin(np.arccos(directions[..., 1])) * (np.pi / environment.shape[0]) ** 2
     cosine = np.clip(directions[..., 2], 0, 1)
     irradiance = (environment * (cosine * solid_angle)[..., None]).sum((0, 1)).mean()
     skin_albedo = skin_of(settings.tone).mean()
-    return (environment * (FACE_RADIANCE * np.pi / (irradiance * skin_albedo))).astype(np.float32)
+    darker = min(1.0, skin_albedo / skin_of(Complexion().tone).mean())
+    return (environment * (FACE_RADIANCE * np.sqrt(darker) * np.pi / (irradiance * skin_albedo))).astype(np.float32)
 
 
 def camera_place(mesh: Mesh, settings: SynthesisSettings) -> tuple[float, float]:
