@@ -87,7 +87,7 @@ class LinearisedFit:
         settings, light = problem.settings, state.light
         slopes = transport.lobes.slopes() if highlights_count and settings.fit_roughness else None
         irradiance, reflection = transport.forward(light)
-        weight = errors.weights(state.radiance(irradiance, reflection)) * errors.fitted
+        weight = errors.weights(state.radiance(irradiance, reflection), highlights_count) * errors.fitted
         evidence = errors.evidence(weight)
         specular_fit, highlights = None, state.specular * reflection
         if highlights_count:

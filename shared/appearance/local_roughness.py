@@ -93,7 +93,7 @@ def local_roughness(
     transport = problem.transport(state)
     irradiance, reflection = transport.forward(state.light)
     model = state.radiance(irradiance, reflection)
-    weight = problem.errors.weights(model)
+    weight = problem.errors.weights(model, glossy=True)
     errors = problem.errors.with_reduced_chi_square(model, weight)
     transport = replace(transport, lobes=None)
     equations = specular_equations_of(problem, state, transport, errors, irradiance, weight * errors.fitted)

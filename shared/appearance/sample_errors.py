@@ -1,9 +1,9 @@
 """How far a model of the clip is from its samples: their noise, their weights and what they count as evidence.
 
 Weights are robust (Cauchy, by reweighting), and clipped or crushed samples only push when the model violates what they
-say (censored data). A sample's variance in a fit is that of the radiance the model expects, not of the sample: else
-what is brighter than expected weighs less than what is darker, and highlights of dark skin come out too weak
-(quasi-likelihood [Wedderburn1974]).
+say (censored data). Once a model has highlights, a sample's variance is that of the radiance which the model expects,
+not the sample's own: else what is brighter than expected weighs less than what is darker, and highlights of dark skin
+come out too weak (quasi-likelihood [Wedderburn1974]). To a matt model highlights are outliers, and best weigh little.
 """
 
 from __future__ import annotations
@@ -81,18 +81,18 @@ class SampleErrors:
             view_weight=self.view_weight[:, index], precision=self.precision[:, index], reliability=own,
         )
 
-    def weights(self, model: torch.Tensor | None) -> torch.Tensor:
-        """[3, P, F] inverse variances as a model [3, P, F] expects them: robust, and zero where a censored sample's
-        bound is inactive; without a model, of all samples that are not censored."""
+    def weights(self, model: torch.Tensor | None, glossy: bool = False) -> torch.Tensor:
+        """[3, P, F] inverse variances under a model [3, P, F], glossy: as expected by one that has highlights. Robust,
+        and zero where a censored sample's bound is inactive; without a model, of all samples that are not censored."""
         weight = self.view_weight * self.precision
         if model is None:
             return weight * (self.saturation == 0)
-        absolute, relative = self.noise
-        of_sample, of_model = (absolute + relative * one for one in (self.colours, model.clamp_min(0.0)))
-        expected = (of_sample / of_model).square()
         error, inactive = self.errors(model)
-        error = error * expected
-        return weight * expected * (~inactive) / (1.0 + error / (CAUCHY * self.spread(error, inactive)))
+        if glossy:
+            absolute, relative = self.noise
+            of_sample, of_model = (absolute + relative * one for one in (self.colours, model.clamp_min(0.0)))
+            weight, error = (values * (of_sample / of_model).square() for values in (weight, error))
+        return weight * (~inactive) / (1.0 + error / (CAUCHY * self.spread(error, inactive)))
 
     def errors(self, model: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Squared errors of a model [3, P, F] over the assumed noise's variance, and where a censored sample's bound

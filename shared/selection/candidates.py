@@ -12,9 +12,9 @@ before it, then highlights, and with these, which show a lamp that matt skin may
 What is judged is the mean absolute error on held-out frames, paired frame by frame, with what the prior on skin says
 against the albedo: where no frame tells light from albedo, shading that ends in the albedo would cost nothing. A
 candidate must let that fall by a share that is worth its unknowns. Where the fall lies within its standard error of
-that share, the frames leave it open, and the fuller model is taken, unless the error rose. Candidates are not all
-nested (a sun in the sky is no special case of harmonics), so that the one beyond a candidate that did not serve is
-tried, too.
+that share, the frames leave it open, and the fuller model is taken, a fuller light only unless the error rose.
+Candidates are not all nested (a sun in the sky is no special case of harmonics), so that the one beyond a candidate
+that did not serve is tried, too.
 
 docs/selection.md derives this, and says what of the marginal likelihood it leaves out.
 
@@ -51,6 +51,8 @@ SPECULARS = ("none", "one_value")
 WORTHWHILE = {"light": 0.005, "specular": 0.0}
 """Share by which a candidate must lower the error: one of the light has more unknowns, and the solver leaves as much
 when it stops. Highlights are there on any skin, and what is unknown of them their priors nearly say."""
+EXISTING = ("specular",)
+"""What is there whether or not held-out frames show it: left open, whose sign then is chance, it is taken."""
 PARTS = ("light", "specular", "samples", "maps")
 """What can be fixed: these candidates, how much of the clip the light is solved from, and how fine the maps are."""
 FEWEST_HELD_OUT = 3
@@ -132,12 +134,12 @@ class Decision(Enum):
         return self is not Decision.DOES_NOT
 
 
-def judge(before: np.ndarray, after: np.ndarray, worthwhile: float) -> Decision:
+def judge(before: np.ndarray, after: np.ndarray, worthwhile: float, exists: bool = False) -> Decision:
     """Whether errors, before [H] and after [H], fell by more than the share worthwhile of them, for certain. One
-    that does not let them fall is not taken where they cannot tell."""
+    that does not let them fall is not taken where they cannot tell, unless what it adds exists on any skin."""
     fall, standard_error = gain(before, after)
     beyond = fall - worthwhile * float(before.mean())
-    if fall > 0.0 and abs(beyond) <= standard_error:
+    if (exists or fall > 0.0) and abs(beyond) <= standard_error:
         return Decision.OPEN
     return Decision.SERVES if beyond > 0.0 else Decision.DOES_NOT
 
@@ -183,7 +185,7 @@ class ModelSelection:
                 missed += 1
                 continue
             trial = self._try(model, self.present.solution)
-            decision = judge(self.present.errors, trial.errors, WORTHWHILE[part])
+            decision = judge(self.present.errors, trial.errors, WORTHWHILE[part], part in EXISTING)
             self.report(describe(part, name, trial, self.present, decision))
             if decision.accepted:
                 self.present, selected, missed = trial, True, 0

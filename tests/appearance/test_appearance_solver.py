@@ -201,8 +201,9 @@ def test_a_sample_weighs_what_its_expected_radiance_says():
     def scale(weight):
         return float((weight * model * errors.colours).sum() / (weight * model * model).sum())
 
-    assert abs(scale(errors.weights(model)) - 1.0) < 0.01
+    assert abs(scale(errors.weights(model, glossy=True)) - 1.0) < 0.01
     assert scale(errors.view_weight * errors.precision) < 0.94
+    assert scale(errors.weights(model)) < 0.97
 
 
 def test_clipped_samples_do_not_bias(one_thread):

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shared.appearance.measured_skin import SURFACE_INTENSITY
 from shared.errors import InputError
 from shared.io.arrays import read_json, write_json
 from shared.io.images import read_png
@@ -133,7 +134,7 @@ def test_highlights_that_stayed_what_they_were_are_told(tiny_run, tmp_path):
             shutil.copy(path, tmp_path / "work" / stage)
     solved = tmp_path / "work" / "inverse_render" / "solve.json"
     solve = read_json(solved)
-    for highlights, fitted, end in ((0.7, False, ""), (2.0, True, "upper")):
+    for highlights, fitted, end in ((SURFACE_INTENSITY, False, ""), (2.0, True, "upper")):
         solve["model"] |= {"roughness": 0.45, "specular_intensity": highlights}
         write_json(solved, solve)
         row = record_columns(tmp_path)

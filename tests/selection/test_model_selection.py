@@ -21,6 +21,7 @@ from shared.inverse.problem import InverseSettings
 from shared.report.content import selection_record
 from shared.report.page import selection_rows
 from shared.selection.candidates import (
+    EXISTING,
     LIGHTS,
     WORTHWHILE,
     Decision,
@@ -80,7 +81,7 @@ def test_every_candidate_is_on_the_record_with_its_error_and_seconds(glossy):
     for record in records[1:]:
         assert record["fall"] == pytest.approx(held_out - record["held_out"], abs=1e-12)
         beyond, uncertain = record["fall"] - WORTHWHILE[record["part"]] * held_out, record["standard_error"]
-        assert record["open"] == (abs(beyond) <= uncertain and record["fall"] > 0.0)
+        assert record["open"] == (abs(beyond) <= uncertain and (record["fall"] > 0.0 or record["part"] in EXISTING))
         assert record["accepted"] == (beyond > uncertain or record["open"])
         assert record["seconds"] > 0.0
         held_out = record["held_out"] if record["accepted"] else held_out
@@ -138,6 +139,8 @@ def test_what_the_standard_error_leaves_open_takes_the_fuller_model():
     assert abs(gain(frames, after)[0]) < gain(frames, after)[1]
     assert judge(after, frames, 0.005) is Decision.OPEN
     assert judge(frames, after, 0.005) is Decision.DOES_NOT  # as uncertain, but if anything worse
+    assert judge(frames, after, 0.0, exists=True) is Decision.OPEN
+    assert judge(frames, frames + 0.001, 0.0, exists=True) is Decision.DOES_NOT  # worse for certain
     assert Decision.OPEN.accepted and not Decision.DOES_NOT.accepted
     assert judge(frames, frames - 0.00002, 0.005) is Decision.DOES_NOT  # all frames gain, but next to nothing
 
