@@ -108,14 +108,16 @@ def whites_statement(samples: Samples, irradiance: np.ndarray) -> tuple[np.ndarr
 
     Their albedo is the slope of radiance over irradiance with the least absolute deviations, which is the median of the
     ratios weighted by the irradiance: what lies in shadow says little. Errors of shading are shared by neighbours: all
-    samples count as few.
+    samples count as few. What scatters the ratios has a colour, a lid's own or that of the light it sends on: their
+    scatter leaves the tint as open as the level.
     """
     lower, albedo = np.log(albedo_of_whites(samples, irradiance, (0.25, 0.5)))
     if not np.isfinite(albedo).all():
         return None
     spread = ROBUST_SCALE * float((albedo - lower).mean())
-    level = LEVEL_SIGMA**2 + spread**2 / INDEPENDENT
-    return albedo - np.log(USUAL_ALBEDO), level + 0.5 * TINT_SIGMA**2 * np.eye(3)
+    scatter = spread**2 / INDEPENDENT
+    tint = 0.5 * (TINT_SIGMA**2 + scatter) * np.eye(3)
+    return albedo - np.log(USUAL_ALBEDO), LEVEL_SIGMA**2 + scatter + tint
 
 
 def albedo_of_whites(samples: Samples, irradiance: np.ndarray, shares: Sequence[float]) -> np.ndarray:

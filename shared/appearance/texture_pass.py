@@ -57,6 +57,10 @@ fit the mean a little better there, too (0.7 %; re-renders + 0.5 dB, albedo - 0.
 so by a fiftieth."""
 REFLECTION = slice(7, 10)
 """Columns of S in the table of a frame's view."""
+LIKELY_BRIGHTER = 1.5 * PRIOR_SPREAD
+"""By how much a texel's log albedo may lie above its surroundings' before it has to be known to better than 1: an edge
+where the mesh is wrong catches a lamp that it should not see. On fair skin that is a white spot, on the darkest one of
+20 times the skin's albedo."""
 HIDING_SPREAD, LEAST_SEEN = 1.0, 0.001
 """Typical difference in log albedo between skin and what hangs before it, and the least that is believed of the
 probability that nothing does."""
@@ -283,7 +287,11 @@ class TexturePass:
         if self.eyes is not None:
             smooth[self.eyes.rows] = self._round_eyes(rough, information)
         brighter = (certain * np.log(np.maximum(rough, 1e-3) / smooth)).sum(1, keepdims=True) / total
-        return equations.drawn_albedo(specular, smooth * np.exp(brighter * left), _ALBEDO_PULL, drawing)
+        albedo = equations.drawn_albedo(specular, smooth * np.exp(brighter * left), _ALBEDO_PULL, drawing)
+        beyond = np.maximum(np.log(albedo / smooth) - LIKELY_BRIGHTER, 0.0)
+        if self.eyes is not None:
+            beyond[self.eyes.rows] = 0.0
+        return albedo * np.exp(-beyond / (1.0 + np.square(information)))
 
     def _without_seams(self, material: TexelMaterial, around: np.ndarray, told: np.ndarray) -> TexelMaterial:
         """The material with what no frame shows going on from what lies beside it, where the log albedo around it [V,

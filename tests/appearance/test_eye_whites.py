@@ -157,6 +157,8 @@ def test_shadows_that_the_light_gets_wrong_say_little_and_scatter_makes_unsure()
     scattered = 0.5 * np.exp(0.8 * np.random.default_rng(1).normal(size=(30, 12))) - 0.5
     unsure = whites_statement(samples_of(np.full(3, 0.5), np.ones((3, 30, 12)), scattered), np.ones((3, 30, 12)))[1]
     assert unsure.mean() > 2.0 * sure.mean()
+    of_tint = np.array([1.0, -1.0, 0.0])
+    assert of_tint @ unsure @ of_tint > 2.0 * (of_tint @ sure @ of_tint), "what scatters them has a colour"
 
 
 def test_whites_move_the_scale_as_far_as_they_are_sure():
