@@ -275,6 +275,7 @@ class TexturePass:
         A channel whose samples have the share q of its albedo leaves 1 - q to a fallback. The texel's brightness b
         beside its neighbourhood, by all channels, is believed by their share q': the fallback has b (q' - q) / (1 - q)
         of it, so that channels that know alike get what their own samples say once, and one that is clipped gets q' b.
+        What lies beyond LIKELY_BRIGHTER than the surroundings counts by how well it is known.
         """
         equations, information = evidence.equations, evidence.information
         pull = _ALBEDO_PULL + equations.ee * (drawing / PRIOR_SPREAD**2)
