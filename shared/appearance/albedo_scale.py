@@ -33,9 +33,9 @@ from shared.appearance.light_tint import LightTint
 from shared.appearance.measured_skin import (
     BRIGHTEST_ALBEDO,
     LUMINANCE_SIGMA,
+    MEDIAN_LOG_LUMINANCE,
+    SKIN_LOCUS,
     TYPICAL_SKIN,
-    SkinLocus,
-    fit_skin_locus,
 )
 from shared.imaging.color import LUMINANCE
 
@@ -92,7 +92,6 @@ class ResolvedScale(NamedTuple):
 def scale_prior(
     log_radiance: np.ndarray,
     white_sigma: float = WHITE_SIGMA,
-    locus: SkinLocus | None = None,
     relative_light: np.ndarray | None = None,
     tints: Sequence[LightTint | None] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -102,9 +101,9 @@ def scale_prior(
     have its own tint where that was measured. tints: of the L lights, None where nothing is known; empty: of none.
     Luminance enters linearised: d log Y = sum_c share_c d log a_c, with the shares of a typical skin.
     """
-    locus = locus or fit_skin_locus()
+    locus = SKIN_LOCUS
     share = LUMINANCE * TYPICAL_SKIN / (LUMINANCE @ TYPICAL_SKIN)
-    constant = float(np.log(LUMINANCE @ TYPICAL_SKIN) - share @ np.log(TYPICAL_SKIN))
+    constant = float(MEDIAN_LOG_LUMINANCE - share @ np.log(TYPICAL_SKIN))
     ratio = np.array([[1.0, -1.0, 0.0], [0.0, -1.0, 1.0]])
     # Rows act on log albedo q = y - u: value = row @ q + const.
     rows, targets, sigmas = [share], [locus.mean_log_luminance - constant], [LUMINANCE_SIGMA]

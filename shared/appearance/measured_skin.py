@@ -73,3 +73,6 @@ def fit_skin_locus(skins: np.ndarray = MEASURED_SKINS) -> SkinLocus:
     residual = chroma - design @ np.stack([offset, slope])
     about_line = (residual**2).sum(0) / (len(skins) - 2)
     return SkinLocus(MEDIAN_LOG_LUMINANCE, offset, slope, np.sqrt(about_line + PERSON_SIGMA**2))
+
+
+SKIN_LOCUS = fit_skin_locus()
