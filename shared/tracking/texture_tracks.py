@@ -88,10 +88,13 @@ def track_frame(
     """Where one frame's contrast picture [H, W] shows the tracked texels.
 
     -> positions [N, 2] px (NaN: not found) and whitening [N, 2, 2] 1/px: whitening @ error has unit covariance where
-    the window's pixels differ from the mean by independent noise.
+    the window's pixels differ from the mean by independent noise. Nothing is found where the believed pose puts the
+    head out of the picture, as the guess for a doubtful frame may.
     """
     known = (placed.shown > 0) & (texture.seen > 0)
     texels = np.flatnonzero(known)
+    if not len(texels):
+        return np.full((len(atlas.rows), 2), np.nan), np.zeros((len(atlas.rows), 2, 2))
     known[atlas.rows, atlas.columns] = True
     moving = np.flatnonzero(known)
     lookups = _Lookups(texels, placed.shown.shape[1])

@@ -233,6 +233,15 @@ def test_skin_that_no_frame_of_the_mean_saw_is_not_tracked(atlas, texture):
     assert np.isfinite(found[atlas.columns > 105]).mean() > 0.85
 
 
+def test_nothing_is_found_of_a_head_that_is_believed_out_of_the_picture(atlas, texture):
+    """As the guess for a doubtful frame may have it: no texel is shown at all."""
+    placed = placed_at(atlas, pose_of(shift=(5000.0, 0.0)))
+    assert not placed.shown.any()
+    found, whitening = track_frame(atlas, texture, render(pose_of(), skin(), NOISE), placed, WINDOWS)
+    assert found.shape == (len(atlas.rows), 2) and np.isnan(found).all()
+    assert whitening.shape == (len(atlas.rows), 2, 2) and np.all(whitening == 0)
+
+
 def test_offset_beyond_the_search_is_refused(atlas, texture):
     true, believed = pose_of(), pose_of(shift=(2.5, 0.0))
     narrow = Windows(sigma=5.0, search=1.5, steps=4)
