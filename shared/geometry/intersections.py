@@ -18,6 +18,8 @@ _MOST_HALVINGS = 4
 _LEAST_AREA = 0.02
 _RINGS = 2
 """Of vertices around a crossing that move less, at first."""
+_STEEPEST = 0.3
+"""Of what vertices move, by how much at most it may change from place to place, mm per mm, where some are held back."""
 
 
 def crossing_edges(vertices: np.ndarray, faces: np.ndarray, edges: np.ndarray | None = None) -> np.ndarray:
@@ -59,8 +61,9 @@ def move_without_crossing(
     """Vertices [V, 3] as near to wanted as goes without crossings that start did not have and without turned faces.
 
     Where moved faces cross, turn over or lose nearly all area, the move of the vertices around is halved, at last
-    undone. Only edges near what has moved since the last look are followed. start [V, 3] and wanted [V, 3]: mm.
-    resting [F] bool: faces that lie on others and may cross them, None: none does.
+    undone; from there it grows to what is wanted over so many millimetres that no step is left in the surface. Only
+    edges near what has moved since the last look are followed. start [V, 3] and wanted [V, 3]: mm. resting [F] bool:
+    faces that lie on others and may cross them, None: none does.
     """
     adjacency = vertex_adjacency(faces, len(start))
     free = faces if resting is None else faces[~resting]
@@ -81,7 +84,22 @@ def move_without_crossing(
         for _ in range(_RINGS + attempt):
             around = np.maximum(around, (adjacency @ around > 0) * 1.0)
         share = np.where(around > 0, 0.5 * share if attempt < _MOST_HALVINGS - 1 else 0.0, share)
+        share = _without_steps(share, around > 0, start, wanted)
     return start + share[:, None] * (wanted - start)
+
+
+def _without_steps(share: np.ndarray, held: np.ndarray, start: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Shares [V] of the moves from start to wanted [V, 3] mm that grow from those of the held vertices [V] bool by no
+    more than _STEEPEST lets them."""
+    longest = float(np.linalg.norm(wanted - start, axis=1).max())
+    distance, nearest = cKDTree(start[held]).query(start, distance_upper_bound=longest / _STEEPEST)
+    near = np.isfinite(distance)
+    nearest = np.nonzero(held)[0][nearest[near]]
+    own = np.linalg.norm((wanted - start)[near], axis=1)
+    limit = share[nearest] + _STEEPEST * distance[near] / np.maximum(own, 1e-9)
+    found = share.copy()
+    found[near] = np.minimum(found[near], limit)
+    return found
 
 
 def _near(vertices: np.ndarray, edges: np.ndarray, moved: np.ndarray) -> np.ndarray:

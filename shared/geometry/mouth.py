@@ -1,4 +1,4 @@
-"""Lips that meet: a slit between them that no open mouth leaves is shut.
+"""Lips that meet: a slit between them that no open mouth leaves is shut; and the inside of a mouth that is open.
 
 What is fitted to skin leaves the lips' margins where it will: in the corners of a mouth, which are dark, and where
 beard or shadow hide the line, the mesh stays open by a millimetre or two, and shows an inside that no frame has seen.
@@ -35,18 +35,33 @@ def shut_lips(surface: Surface) -> np.ndarray:
     """Vertices [V, 3] mm of a head that looks along +z, with lips that meet; as they are where the mesh has no lips, no
     inside of the mouth, or a mouth that is open."""
     vertices = surface.mesh.vertices
-    if surface.face_segment is None or not {"lips", "inner_mouth"} <= set(surface.segment_names):
+    if not _has_mouth(surface):
         return vertices
     lips, inside = surface.vertices_of(("lips",)), surface.faces_of(("inner_mouth",))
     movable = surface.vertices_of(("lips", "inner_mouth", "upper_lip_skin", "chin"))
     for turn in rotation_from_vector(np.radians(PITCHES_DEG)[:, None] * [1.0, 0.0, 0.0]):
         seen = vertices @ turn.T
         slit = _slit(seen, surface.mesh.faces, inside, lips)
-        if slit is not None and np.nanmax(slit.top - slit.bottom) > OPEN_MM:
+        if slit is not None and slit.stands_open:
             return surface.mesh.vertices
         if slit is not None:
             vertices = vertices + (_closed(seen, movable, lips, slit) - seen) @ turn
     return vertices
+
+
+def inside_of_open_mouth(surface: Surface) -> np.ndarray:
+    """[V] bool: vertices of the inside of a mouth that stands open, of a head that looks along +z; none of a mouth that
+    is shut, or where the mesh has no lips or no inside."""
+    if _has_mouth(surface):
+        inside, lips = surface.faces_of(("inner_mouth",)), surface.vertices_of(("lips",))
+        slit = _slit(surface.mesh.vertices, surface.mesh.faces, inside, lips)
+        if slit is not None and slit.stands_open:
+            return surface.vertices_of(("inner_mouth",))
+    return np.zeros(len(surface.mesh.vertices), bool)
+
+
+def _has_mouth(surface: Surface) -> bool:
+    return surface.face_segment is not None and {"lips", "inner_mouth"} <= set(surface.segment_names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +71,11 @@ class _Slit:
     across: np.ndarray
     bottom: np.ndarray
     top: np.ndarray
+
+    @property
+    def stands_open(self) -> bool:
+        """Is it as high somewhere as an open mouth's?"""
+        return bool(np.nanmax(self.top - self.bottom) > OPEN_MM)
 
 
 def _slit(vertices: np.ndarray, faces: np.ndarray, inside: np.ndarray, lips: np.ndarray) -> _Slit | None:

@@ -9,6 +9,7 @@ from shared.appearance.material_mixture import material_probabilities
 from shared.appearance.problem import AppearanceState
 from shared.compute.run_context import SILENT, RunContext
 from shared.geometry.mesh import Mesh
+from shared.geometry.mouth import inside_of_open_mouth
 from shared.geometry.surface import Surface
 from shared.hair.hair_pixels import BEARD
 from shared.imaging.image_sampling import SurfaceViewer
@@ -64,13 +65,15 @@ def hidden_places(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray
 
 def matt_share(viewer: SurfaceViewer, surface: Surface, materials: np.ndarray, hidden: np.ndarray, scalp: np.ndarray
                ) -> np.ndarray:
-    """[V] how much of a place is hair that grows there, whose highlights lie along its strands: the surface's own lobe
-    would shine like plastic. What no frame shows continues the rest of scalp [V] bool, or of the skin. surface: the
-    viewer's, with segments; materials [V, len(LABELS)]; hidden [V]: see hidden_places."""
+    """[V] how much of a place has none of the surface's highlights: hair that grows there, whose own lie along its
+    strands, so that the surface's lobe would shine like plastic, and the inside of an open mouth, of whose teeth and
+    tongue the mesh knows nothing. What no frame shows continues the rest of scalp [V] bool, or of the skin. surface:
+    the viewer's, with segments; materials [V, len(LABELS)]; hidden [V]: see hidden_places."""
     known, shown = _shown(materials)
     fields = SmoothFields(viewer.mesh, 1.0, FAR_EDGES, scalp)
     share = fields.through(shown[:, HAIR, None], FAR_EDGES * known[:, None], np.zeros(1))[:, 0]
-    return np.where(surface.vertices_of(("ears",)), 0.0, np.clip(share, 0.0, 1.0) * (1.0 - hidden))
+    hair = np.where(surface.vertices_of(("ears",)), 0.0, np.clip(share, 0.0, 1.0) * (1.0 - hidden))
+    return np.maximum(hair, inside_of_open_mouth(surface))
 
 
 def _shown(materials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ import pytest
 from shapes import grid_plane, sphere
 
 from shared.geometry.intersections import crossing_edges, move_without_crossing, turned_faces
+from shared.geometry.mesh import mesh_edges
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +53,22 @@ def test_a_move_stops_before_it_cuts_and_goes_on_elsewhere(ball):
     assert len(crossing_edges(placed, ball.faces)) == 0
     assert not turned_faces(ball.vertices, placed, ball.faces).any()
     np.testing.assert_allclose(placed[aside], wanted[aside])
+
+
+def test_a_move_that_is_held_back_somewhere_leaves_no_step():
+    """A sheet that rises by 3 mm, but for a fold: from there it rises slowly, and farther off as it is wanted."""
+    plane = grid_plane(41, 40.0)
+    wanted = plane.vertices + [0.0, 0.0, 3.0]
+    middle = int(np.argmin(np.abs(plane.vertices[:, :2] - plane.vertices[:, :2].mean(0)).sum(1)))
+    wanted[middle, 0] += 1.6
+    placed = move_without_crossing(plane.vertices, wanted, plane.faces)
+    assert not turned_faces(plane.vertices, placed, plane.faces).any()
+    rise, edges = placed[:, 2], mesh_edges(plane.faces)[0]
+    assert rise[middle] < 2.0
+    length = np.linalg.norm(plane.vertices[edges[:, 0]] - plane.vertices[edges[:, 1]], axis=1)
+    assert (np.abs(rise[edges[:, 0]] - rise[edges[:, 1]]) < 0.31 * length).all()
+    far = np.linalg.norm(plane.vertices - plane.vertices[middle], axis=1) > 15.0
+    np.testing.assert_array_equal(placed[far], wanted[far])
 
 
 def test_faces_that_rest_on_others_may_cross_them_but_not_turn(ball):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shared.geometry.mouth import shut_lips
+from shared.geometry.mouth import inside_of_open_mouth, shut_lips
 from shared.geometry.raycast import RayScene
 from shared.geometry.surface import Surface
 from shared.geometry.transforms import rotation_from_vector
@@ -56,3 +56,11 @@ def test_an_open_mouth_and_a_mesh_without_lips_stay(model):
     assert np.array_equal(shut_lips(opened), opened.mesh.vertices)
     bare = Surface(with_jaw(model, 0.06).mesh)
     assert np.array_equal(shut_lips(bare), bare.mesh.vertices)
+
+
+def test_only_an_open_mouth_has_an_inside(model):
+    opened, slit = with_jaw(model, 1.0), with_jaw(model, 0.06)
+    assert np.array_equal(inside_of_open_mouth(opened), opened.vertices_of(("inner_mouth",)))
+    assert inside_of_open_mouth(opened).sum() > 20
+    for shut in (slit, Surface(opened.mesh)):
+        assert not inside_of_open_mouth(shut).any()

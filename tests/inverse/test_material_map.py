@@ -87,6 +87,20 @@ def test_hair_that_grows_is_matt_and_what_no_frame_shows_of_the_scalp_like_the_r
     assert not matt[neck | ears].any() and matt[face].max() < 0.01
 
 
+def test_the_inside_of_an_open_mouth_has_no_highlights_and_that_of_a_shut_one_is_left_alone():
+    model = load_head_model()
+    for down, open_mouth in ((1.0, True), (0.0, False)):
+        expression = np.zeros(len(model.expression_names))
+        expression[list(model.expression_names).index("jaw_open")] = down
+        surface = model.surface(model.shape(np.zeros(len(model.identity_basis)), expression))
+        viewer, nothing = SurfaceViewer.of(surface.mesh), np.zeros(len(surface.mesh.vertices))
+        scalp = surface.vertices_of(("scalp",))
+        matt = matt_share(viewer, surface, all_of(surface, skin=1.0), nothing, scalp)
+        inside = surface.vertices_of(("inner_mouth",))
+        assert np.all(matt[inside] == 1.0) if open_mouth else matt[inside].max() < 0.01
+        assert matt[~inside].max() < 0.01
+
+
 def test_materials_as_a_map_sum_to_one():
     surface, viewer = head()
     materials = all_of(surface)
