@@ -48,6 +48,8 @@ POINTS, PROPOSAL_WIDTH = 2048, 1.5
 """Of the importance sampling, and by how much it reaches farther than the normal distribution of the same curvature."""
 NINE_OF_TEN = 1.645
 """Standard deviations to both sides of a normal distribution's mean that hold nine tenths of it."""
+LEAST_LEFT = 0.02
+"""Of the diffuse radiance, at least, where highlights grow with the light."""
 MODEL_ERROR = 0.003
 """Share of the diffuse radiance that passes for highlights where shape or visibility are a little off."""
 
@@ -145,6 +147,7 @@ def resolve_scale(
     log_brightest: np.ndarray | None = None,
     whites: tuple[np.ndarray, np.ndarray] | None = None,
     tints: Sequence[LightTint | None] = (),
+    shine: np.ndarray | None = None,
 ) -> ResolvedScale:
     """The factor on the light per channel and the specular intensity that are jointly most likely.
 
@@ -153,7 +156,10 @@ def resolve_scale(
     log_irradiance [3] are the skin's present means; specular_prior: mean of s and standard deviation of its logarithm;
     chart: the log factor [3] on the light that a colour chart asks for, and its covariance [3, 3]; relative_light and
     tints: see scale_prior; log_brightest [3]: log of the skin's present albedo at the quantile BRIGHTEST, None: it is
-    not asked; whites: as chart, of the whites of the eyes.
+    not asked; whites: as chart, of the whites of the eyes; shine [3]: radiance, relative to the diffuse one, of
+    highlights that the model has but that say nothing, None: it has none. They grow with the light and take what they
+    gain from the albedo, which gets darker and redder by it: taken for the tint of darker skin, that would ask for ever
+    more light.
     With a chart the highlights give s alone: on the scale their range has little to add, and the model's errors pass
     for highlights.
     -> log k and s, without highlights the prior's mean of s; how far the mean lies from there, with highlights only;
@@ -184,18 +190,27 @@ def resolve_scale(
             specular = float(np.exp(solved.x[0]))
         return ResolvedScale(alone, specular, np.linalg.inv(matrix.T @ matrix), prior_covariance)
 
+    def taken(x: np.ndarray) -> np.ndarray | float:
+        if shine is None:
+            return 0.0
+        return np.log(np.maximum(1.0 + shine * (1.0 - np.exp(x[..., :3])), LEAST_LEFT))
+
     def on_skin(x: np.ndarray) -> np.ndarray:
-        return x[..., :3] @ matrix.T - right
+        said = x[..., :3] @ matrix.T - right
+        if shine is not None:
+            said[..., :3] -= taken(x) @ matrix[:3].T
+        return said
 
     def too_bright(x: np.ndarray) -> np.ndarray:
         if log_brightest is None:
             return np.zeros((*x.shape[:-1], 3))
-        return np.maximum(log_brightest - x[..., :3] - np.log(BRIGHTEST_ALBEDO), 0.0) / BRIGHTEST_SIGMA
+        return np.maximum(log_brightest - x[..., :3] + taken(x) - np.log(BRIGHTEST_ALBEDO), 0.0) / BRIGHTEST_SIGMA
 
     if highlights is None:
         # Measured skins keep to the bound by themselves: it tells nothing new of what they alone expect. But where
         # the mode lies on it, its curvature is not what is known.
-        mode = least_squares(lambda x: np.concatenate([on_skin(x), too_bright(x)]), alone, method="lm").x
+        start = alone if shine is None else np.zeros(3)
+        mode = least_squares(lambda x: np.concatenate([on_skin(x), too_bright(x)]), start, method="lm").x
         if log_brightest is None:
             covariance = np.linalg.inv(matrix.T @ matrix)
         else:

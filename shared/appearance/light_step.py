@@ -275,10 +275,12 @@ class LinearisedFit:
             return ResolvedFit(state, transport, irradiance, reflection, albedo, changed)
         albedo = self._albedo(state, irradiance, state.specular * reflection)
         log_albedo, log_irradiance, _ = problem.mean_on_skin(albedo, irradiance, transport)
-        highlights = None
+        highlights, shine = None, None
         if self.highlights_count:
             highlights = measure_highlights(self.errors, irradiance, reflection, self.weight,
                                             self.specular_fit.design_effect)
+        elif settings.specular:
+            shine = problem.shine_on_skin(albedo * irradiance, state.specular * reflection)
         relative = problem.relative_light(irradiance)
         chart = problem.capture.chart
         if chart is not None:
@@ -287,7 +289,7 @@ class LinearisedFit:
         scale = resolve_scale(
             log_albedo, log_irradiance, highlights, settings.specular_prior, settings.white_sigma, chart=chart,
             relative_light=relative, log_brightest=problem.brightest_skin(albedo), whites=problem.said_by_whites(state),
-            tints=settings.tints,
+            tints=settings.tints, shine=shine,
         )
         log_factor = scale.log_factor
         factor = torch.from_numpy(np.exp(log_factor).astype(np.float32))[:, None, None]

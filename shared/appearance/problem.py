@@ -363,6 +363,11 @@ class AppearanceProblem:
         gauge = transport.irradiance_adjoint((weight / total / mean[:, None, None]).expand_as(irradiance))
         return log_albedo.double().numpy(), torch.log(mean).double().numpy(), gauge
 
+    def shine_on_skin(self, diffuse: torch.Tensor, highlights: torch.Tensor) -> np.ndarray:
+        """[3]: the skin's mean radiance of highlights relative to its mean diffuse radiance, both [3, P, F]."""
+        weight = self.skin_weight
+        return ((weight * highlights).sum((1, 2)) / (weight * diffuse).sum((1, 2))).double().numpy()
+
     def brightest_skin(self, albedo: torch.Tensor) -> np.ndarray:
         """[3]: log of the skin points' albedo [3, P, 1] at the quantile BRIGHTEST."""
         return np.log(np.quantile(albedo[:, torch.from_numpy(self.capture.skin), 0].numpy(), BRIGHTEST, axis=1))

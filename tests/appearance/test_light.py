@@ -292,3 +292,36 @@ def test_frames_are_spread_and_held_out_evenly():
     fitted = hold_out(40, 8)
     assert np.nonzero(~fitted)[0].tolist() == [4, 12, 20, 28, 36]
     assert hold_out(8, 8).all()
+
+
+@pytest.mark.parametrize(
+    ("albedo", "shine", "astray"), [([0.274, 0.114, 0.055], 0.02, 0.8), ([0.2, 0.05, 0.02], 0.03, 3.0)]
+)
+def test_highlights_that_grow_with_the_light_do_not_lead_the_scale_away(albedo, shine, astray):
+    """Red skin beside white highlights that say nothing. What they take from the albedo as the light grows makes it
+    dark and red, as if it were darker skin, which asks for more light. Step by step the scale comes to rest near where
+    it was, and runs away where each step takes the diffuse radiance for given."""
+    whole = np.array(albedo) + shine
+
+    def levels(known: bool) -> list[np.ndarray]:
+        found = [np.zeros(3)]
+        for _ in range(12):
+            level = np.clip(found[-1], -5.0, 5.0)
+            highlights = shine * np.exp(level)
+            diffuse = np.maximum(whole - highlights, 1e-3)
+            share = highlights / diffuse if known else None
+            step = resolve_scale(np.log(diffuse) - level, level, None, (0.84, 0.25), shine=share).log_factor
+            found.append(level + step)
+        return found
+
+    rested = levels(known=True)
+    assert np.abs(rested[-1]).max() < 0.7 and np.abs(rested[-1] - rested[-2]).max() < 0.01
+    assert np.abs(levels(known=False)[-1]).max() > astray
+
+
+def test_highlights_that_are_none_change_nothing():
+    skin = np.log([0.3, 0.2, 0.12])
+    plain = resolve_scale(skin, np.zeros(3), None, (0.84, 0.25), log_brightest=skin + 0.5)
+    none = resolve_scale(skin, np.zeros(3), None, (0.84, 0.25), log_brightest=skin + 0.5, shine=np.zeros(3))
+    np.testing.assert_allclose(none.log_factor, plain.log_factor, atol=1e-6)
+    np.testing.assert_allclose(none.covariance, plain.covariance, rtol=1e-5)
