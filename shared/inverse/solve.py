@@ -227,7 +227,7 @@ def warnings_about(result: InverseResult) -> list[str]:
         )
     if (result.texels.maps["confidence"] > 0.5).mean() < LEAST_SEEN_SHARE:
         found.append("the clip determines hardly any of the maps (see the confidence map): its frames contradict each "
-                     "other, or are too dark or blurred")
+                     "other, are too dark or blurred, or do not encode light as colour.transfer says")
     if solution.held_out > 0.06:
         found.append(f"the model explains the clip poorly: residual {solution.held_out:.3f} of full scale")
     return found
