@@ -57,8 +57,8 @@ _ADVICE = (
      "Look at the error maps: large even areas mean that the light changed or moved along, edges that the shape is "
      "off. Film again if the face itself is red or blue."),
     (r"hardly any of the maps",
-     "Rely on no map where the confidence map is dark. Film with more light, sharper, with exposure, white balance and "
-     "lamps that stay."),
+     "Rely on no map where the confidence map is dark. Check colour: transfer in subject.yaml. Film with more light, "
+     "sharper, with exposure, white balance and lamps that stay."),
     (r"no colour", "Give the original in colour: only brightness can be solved from this one."),
     (r"are linear|transfer", "Set colour: transfer in subject.yaml to what the camera wrote."),
     (r"colour matrix", "Nothing to do if skin looks right here; else convert the clip with its matrix stated."),
