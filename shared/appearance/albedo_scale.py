@@ -190,15 +190,14 @@ def resolve_scale(
             specular = float(np.exp(solved.x[0]))
         return ResolvedScale(alone, specular, np.linalg.inv(matrix.T @ matrix), prior_covariance)
 
-    def taken(x: np.ndarray) -> np.ndarray | float:
+    def taken(x: np.ndarray) -> np.ndarray:
         if shine is None:
-            return 0.0
+            return np.zeros_like(x[..., :3])
         return np.log(np.maximum(1.0 + shine * (1.0 - np.exp(x[..., :3])), LEAST_LEFT))
 
     def on_skin(x: np.ndarray) -> np.ndarray:
         said = x[..., :3] @ matrix.T - right
-        if shine is not None:
-            said[..., :3] -= taken(x) @ matrix[:3].T
+        said[..., :3] -= taken(x) @ matrix[:3].T
         return said
 
     def too_bright(x: np.ndarray) -> np.ndarray:
