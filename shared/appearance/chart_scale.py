@@ -29,7 +29,7 @@ from shared.capture.chart import COLUMNS, CORNERS, GLARE_SIGMA, PATCHES, ChartOb
 from shared.geometry.raycast import RayScene
 from shared.geometry.transforms import WORLD_FROM_CAMERA, fibonacci_sphere, invert_rigid, pixel_rays
 from shared.imaging.color import LUMINANCE
-from shared.rendering.envmap import cube_lookup
+from shared.rendering.envmap import cube_lookup, cube_resolution
 
 CORNER_SIGMA_PX = 0.3
 JITTERS = 12
@@ -131,7 +131,7 @@ class ChartStatement:
         skin [3]: mean radiance of the head. The median over the views: what spoils some (a hand, a shadow passing by)
         spoils hardly all. Channels err together, so their ratios are known better than the whole.
         """
-        directions, lookup = _sphere(round((len(light) / 6) ** 0.5))
+        directions, lookup = _sphere(cube_resolution(light))
         radiance = lookup @ light
         said = [view.log_factor(radiance, skin) for view in self.views]
         factors = np.stack([factor for factor, _ in said])

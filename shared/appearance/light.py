@@ -12,7 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sparse
 
-from shared.rendering.envmap import cube_directions, cube_lookup, cube_smoothness, cube_solid_angles, frame_lookup
+from shared.rendering.envmap import (
+    cube_directions,
+    cube_lookup,
+    cube_resolution,
+    cube_smoothness,
+    cube_solid_angles,
+    frame_lookup,
+)
 
 
 @dataclass(frozen=True)
@@ -99,5 +106,5 @@ class LogPrior:
 def resample_light(light: np.ndarray, resolution: int) -> np.ndarray:
     """The light [6 n^2, C] on a cubemap of another resolution, interpolated bilinearly as FrameLight does, so that
     surfaces receive the same: between logarithms a lamp of one texel would lose most of its light."""
-    source = round((len(light) / 6) ** 0.5)
+    source = cube_resolution(light)
     return cube_lookup(cube_directions(resolution), source) @ light

@@ -28,7 +28,7 @@ from shared.imaging.views import Views
 from shared.inverse.lit_surface import LitSurface, report_to
 from shared.inverse.problem import InverseSettings
 from shared.rendering.direction_set import PARTS, concentrated, split_directions, widest_spacing
-from shared.rendering.envmap import cube_directions, cube_solid_angles
+from shared.rendering.envmap import cube_directions, cube_resolution, cube_solid_angles, lamp_solid_angle, lamp_texels
 from shared.rendering.near_lamp import FAR, NearLamp, SeenLamp
 from shared.rendering.shading import light_along
 from shared.rendering.transfer import spread_vertices
@@ -41,8 +41,6 @@ NEAREST_MM = 300.0
 """Nearer, a lamp would stand among hair and shoulders."""
 POINTS, FIRST_STEPS, STEPS = 400, 8, 3
 """Surface points that distances are judged on, and steps of the light at the first and at each other distance."""
-LAMP_REACH, LAMP_SHARE = np.radians(30.0), 0.1
-"""Texels so near to the brightest, and so bright beside it, belong to its lamp."""
 LEAST_LAMP_SHARE = 0.25
 """Of the light, along directions that a lamp shines from: of one that gives less, the distance hardly shows."""
 PASSING_POINTS = 64
@@ -112,24 +110,22 @@ def describe_lamp(
     """What solve.json says of the main lamp of a light [6 n^2, 3], as seen from the head's mean place, where envmap.exr
     sees the light from; empty where its distance was not asked for.
 
-    A ball of radiance L and radius r at a distance D gives pi L r^2 / D^2 head-on: that of the lamp's solid angle, the
-    square of its irradiance over the integral of the squared radiance.
+    A ball of radiance L and radius r at a distance D gives pi L r^2 / D^2 head-on: that of the lamp's solid angle.
     """
     if lamp is None:
         return dict(record)
     head = places_in_world(views.camera_from_head, moves).mean(0)
-    resolution = round((len(light) / 6) ** 0.5)
+    resolution = cube_resolution(light)
     texels, seen = lamp.texels(resolution), lamp.seen_from(head, resolution)
-    solid, own = cube_solid_angles(resolution)[texels], light[texels]
-    grey = own.mean(1)
-    solid_angle = float((grey @ solid) ** 2 / (grey**2 @ solid))
+    solid_angle = lamp_solid_angle(light, texels)
+    power = cube_solid_angles(resolution)[texels] @ light[texels]
     return record | {
         "distance_mm": round(seen.distance_mm, 1),
         "position_mm": lamp.position.round(2).tolist(),
         "centre_mm": head.round(2).tolist(),
         "reach": round(seen.radius, 5),
         "radius_mm": round(lamp.distance_mm * (solid_angle / np.pi) ** 0.5, 2),
-        "radiance": (solid @ own / solid_angle).round(4).tolist(),
+        "radiance": (power / solid_angle).round(4).tolist(),
     }
 
 
@@ -140,14 +136,11 @@ def main_lamp(light: np.ndarray, capture: Capture, views: Views, moves: str, dis
     Its centre is the mean place of the capture's points in the views: what they see of the lamp on average is the same
     at each distance, so that the light at one is a good start for another.
     """
-    resolution = round((len(light) / 6) ** 0.5)
-    directions, brightness = cube_directions(resolution), light.mean(1)
-    brightest = brightness.argmax()
-    own = directions @ directions[brightest] > np.cos(LAMP_REACH)
-    own &= brightness > LAMP_SHARE * brightness[brightest]
-    power = brightness[own] * cube_solid_angles(resolution)[own]
-    axis = normalised(power @ directions[own])
-    radius = float(np.arccos(np.clip(directions[own] @ axis, -1.0, 1.0)).max() + 1.0 / resolution)
+    resolution, own = cube_resolution(light), lamp_texels(light)
+    directions = cube_directions(resolution)[own]
+    power = light[own].mean(1) * cube_solid_angles(resolution)[own]
+    axis = normalised(power @ directions)
+    radius = float(np.arccos(np.clip(directions @ axis, -1.0, 1.0)).max() + 1.0 / resolution)
     centre = capture.points.positions.mean(0) @ capture.world_from_head.mean(0).T
     centre += places_in_world(views.camera_from_head, moves).mean(0)
     return NearLamp(distance_mm, tuple(centre.tolist()), tuple(axis.tolist()), radius)

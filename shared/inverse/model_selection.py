@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from shared.appearance.chart_scale import ChartStatement
-from shared.appearance.fit import Solution, fit_all_points
+from shared.appearance.fit import Solution, fit_appearance
 from shared.appearance.observations import Capture
 from shared.compute.run_context import RunContext
 from shared.compute.threads import single_thread
@@ -91,7 +91,7 @@ def select(
     if "maps" not in settings.selection:
         chosen = replace(chosen, map_size=fitting_map_size(surface, views, settings.map_size))
     lit = LitSurface.of(surface, some_views(views, chosen, chosen.light_frames), chosen, chart, context)
-    solution = fit_all_points(lit.coarse, chosen.appearance, present.solution, report_to(context))
+    solution = fit_appearance(lit.coarse, chosen.appearance, report_to(context), start=present.solution)
     return SelectedModel(chosen, lit, solution, tuple(records))
 
 

@@ -31,6 +31,7 @@ from shared.inverse.result import InverseResult, SolvedTexels
 from shared.io.arrays import load_arrays, save_arrays
 from shared.published.settings import ReferenceSettings
 from shared.published.solver import ReferenceSolver, Start
+from shared.rendering.envmap import cube_resolution
 from shared.rendering.precomputed_transfer import precompute_transfer
 
 START_FRAMES, JUDGED_FRAMES, JUDGED_PIXELS = 32, 6, 2000
@@ -215,7 +216,7 @@ def map_material(solver: ReferenceSolver, average: Average) -> TexelMaterial:
 def final_state(solver: ReferenceSolver, material: TexelMaterial, roughness: float, nodes: int) -> AppearanceState:
     """The light, made coarse enough for the transfer's renderer, and typical material."""
     light = solver.light().detach().cpu().double().numpy()
-    edge = round((len(light) / 6) ** 0.5)
+    edge = cube_resolution(light)
     while edge > LARGEST_RESULT_LIGHT:
         light = light.reshape(6, edge // 2, 2, edge // 2, 2, 3).mean((2, 4)).reshape(-1, 3)
         edge //= 2

@@ -17,7 +17,7 @@ import scipy.sparse as sparse
 import torch
 
 from shared.rendering.brdf import MINIMUM_COSINE, microfacet_integrals
-from shared.rendering.envmap import cube_directions, cube_solid_angles, cube_texel, padded_cube_index
+from shared.rendering.envmap import cube_directions, cube_resolution, cube_solid_angles, cube_texel, padded_cube_index
 from shared.rendering.split_sum import frames_about, mirrored_about_axis
 
 LEAST_ROUGHNESS, ROUGH_LEVEL = 0.08, 0.5
@@ -208,7 +208,7 @@ class LightSampling:
     light [6 n^2, 3]."""
 
     def __init__(self, light: torch.Tensor):
-        self.resolution = round((len(light) / 6) ** 0.5)
+        self.resolution = cube_resolution(light)
         brightness = light.detach().mean(1).double()
         brightness = brightness + FLOOR * brightness.mean().clamp_min(1e-9)
         solid = torch.from_numpy(cube_solid_angles(self.resolution))

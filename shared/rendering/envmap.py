@@ -28,6 +28,9 @@ _FACE_AXES = np.array(
 # The same as coordinate and sign: each axis of a face is one of the three, forwards or backwards.
 _COORDINATE, _SIGN = np.abs(_FACE_AXES).argmax(-1), _FACE_AXES.sum(-1)
 
+LAMP_REACH, LAMP_SHARE = np.radians(30.0), 0.1
+"""Texels so near to the brightest, and so bright beside it, belong to its lamp."""
+
 
 def cube_directions(resolution: int) -> np.ndarray:
     """[6 n^2, 3] unit directions of the texel centres."""
@@ -47,6 +50,27 @@ def cube_solid_angles(resolution: int) -> np.ndarray:
     x, y = np.meshgrid(edge, edge)
     corner = np.arctan2(x * y, np.sqrt(x * x + y * y + 1.0))
     return np.tile(np.diff(np.diff(corner, axis=0), axis=1).ravel(), 6)
+
+
+def lamp_texels(light: np.ndarray) -> np.ndarray:
+    """[6 n^2] bool: the brightest texel of a cubemap, light [6 n^2, 3] linear, and those around it that are of its
+    lamp."""
+    directions, brightness = cube_directions(cube_resolution(light)), light.mean(1)
+    brightest = brightness.argmax()
+    near = directions @ directions[brightest] > np.cos(LAMP_REACH)
+    return near & (brightness > LAMP_SHARE * brightness[brightest])
+
+
+def lamp_solid_angle(light: np.ndarray, texels: np.ndarray) -> float:
+    """sr, of the disc of one radiance that gives both the irradiance and the integral of the squared radiance that some
+    texels [K] of a cubemap, light [6 n^2, 3] linear, give: E^2 / integral of L^2."""
+    solid, radiance = cube_solid_angles(cube_resolution(light))[texels], light[texels].mean(1)
+    return float((radiance @ solid) ** 2 / (radiance**2 @ solid))
+
+
+def cube_resolution(cube: np.ndarray) -> int:
+    """n of a cubemap, cube [6 n^2, ...]."""
+    return round((len(cube) / 6) ** 0.5)
 
 
 def cube_face_coordinates(directions: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -167,7 +191,7 @@ def latlong_lookup(image: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 def latlong_from_cube(cube: np.ndarray, height: int, samples: int = 2) -> np.ndarray:
     """[6 n^2, C] -> [height, 2 height, C] float32, each pixel the mean of samples^2 look-ups."""
-    resolution = round((len(cube) / 6) ** 0.5)
+    resolution = cube_resolution(cube)
     directions = latlong_directions(height, samples)
     values = cube_lookup(directions.reshape(-1, 3), resolution) @ np.asarray(cube, np.float64)
     blocks = values.reshape(height, samples, 2 * height, samples, -1)

@@ -31,6 +31,7 @@ from shared.geometry.transforms import places_in_world, world_from_head
 from shared.rendering.envmap import (
     cube_directions,
     cube_lookup,
+    cube_resolution,
     cube_solid_angles,
     latlong_directions,
     latlong_from_cube,
@@ -104,7 +105,7 @@ class SeenLamp:
 def without_lamp(light: np.ndarray, lamp: NearLamp) -> np.ndarray:
     """A light [6 n^2, 3] with its lamp dark: what is far away."""
     far = np.array(light)
-    far[lamp.texels(round((len(light) / 6) ** 0.5))] = 0.0
+    far[lamp.texels(cube_resolution(light))] = 0.0
     return far
 
 
@@ -116,7 +117,7 @@ def latlong_at(light: np.ndarray, lamp: NearLamp, place: np.ndarray, height: int
     It shines alike to all sides, so that its radiance grows as the cosine between w and d falls.
     """
     far = without_lamp(light, lamp)
-    resolution = round((len(light) / 6) ** 0.5)
+    resolution = cube_resolution(light)
     directions = latlong_directions(height, samples).reshape(-1, 3)
     offset = (np.asarray(place) - lamp.centre) / lamp.distance_mm
     along = directions @ offset

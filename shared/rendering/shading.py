@@ -24,7 +24,7 @@ from shared.compute.threads import share_out, thread_count
 from shared.geometry.mesh import normalised
 from shared.geometry.transforms import camera_centres, vector_from_rotation, world_from_head
 from shared.rendering.brdf import hemispherical_albedo
-from shared.rendering.envmap import frame_lookup
+from shared.rendering.envmap import cube_resolution, frame_lookup
 from shared.rendering.irradiance_errors import SHADOW_MM, irradiance_slope, shadow_uncertainty
 from shared.rendering.lobes import SpecularTransfer, specular_reflection
 from shared.rendering.near_lamp import LampView, NearLamp, SeenLamp, without_lamp
@@ -300,7 +300,7 @@ class LampShine:
     @classmethod
     def of(cls, light: np.ndarray, seen: SeenLamp, directions: np.ndarray) -> LampShine:
         """That of a cubemap light [6 n^2, 3], for points whose visibility is known along directions [J, 3]."""
-        view = LampView(seen, round((len(light) / 6) ** 0.5), directions)
+        view = LampView(seen, cube_resolution(light), directions)
         return cls(view, view.radiance(light), without_lamp(light, seen.lamp))
 
     def vectors(self, points: Points, visible: np.ndarray, frames: np.ndarray | slice) -> np.ndarray:

@@ -36,6 +36,7 @@ from shared.appearance.fit import Solution, fit_appearance
 from shared.appearance.observations import Capture
 from shared.appearance.problem import AppearanceProblem, AppearanceSettings
 from shared.rendering.direction_set import concentrated
+from shared.rendering.envmap import lamp_solid_angle, lamp_texels
 from shared.rendering.shading import light_along
 
 LIGHTS = {
@@ -52,7 +53,8 @@ WORTHWHILE = {"light": 0.005, "specular": 0.0}
 """Share by which a candidate must lower the error: one of the light has more unknowns, and the solver leaves as much
 when it stops. Highlights are there on any skin, and what is unknown of them their priors nearly say."""
 EXISTING = ("specular",)
-"""What is there whether or not held-out frames show it: left open, whose sign then is chance, it is taken."""
+"""What is there whether or not held-out frames show it: left open, whose sign then is chance, it is taken. So is the
+shape of a lamp that a cubemap is too coarse for."""
 PARTS = ("light", "specular", "samples", "maps")
 """What can be fixed: these candidates, how much of the clip the light is solved from, and how fine the maps are."""
 FEWEST_HELD_OUT = 3
@@ -63,6 +65,9 @@ SELECTION_PRECISION = (10, 0.03)
 """Of a step of the light while candidates are tried: the chosen model is solved again, with full precision."""
 FINE_LIGHTS, FINE_MOVES = ("cubemap_16", "cubemap_32"), 4
 """What these add, the shape of a lamp, only comes out in several steps of the whole solve's precision."""
+UNRESOLVED = 5.0
+"""Texels of a cubemap, on which a lamp that covers fewer is as wide as its smoothness lets it be: a point of light
+covers 2.5 to 4.5, the sun in a sky 5.7, a window or a soft box 12 and more."""
 LOOK_AHEAD = 2
 
 
@@ -184,8 +189,9 @@ class ModelSelection:
             if model in self.tried:
                 missed += 1
                 continue
+            exists = part in EXISTING or name in FINE_LIGHTS and self._leaves_lamp_unresolved()
             trial = self._try(model, self.present.solution)
-            decision = judge(self.present.errors, trial.errors, WORTHWHILE[part], part in EXISTING)
+            decision = judge(self.present.errors, trial.errors, 0.0 if exists else WORTHWHILE[part], exists)
             self.report(describe(part, name, trial, self.present, decision))
             if decision.accepted:
                 self.present, selected, missed = trial, True, 0
@@ -198,6 +204,17 @@ class ModelSelection:
         capture, light = self.capture, self.present.solution.state.light
         along = light_along(light, capture.directions, capture.world_from_head, capture.light_index)
         return bool(concentrated(along).any())
+
+    def _leaves_lamp_unresolved(self) -> bool:
+        """Whether a cubemap is as coarse as the lamp that it shows, so that a finer one's shape of it is there in any
+        case. Errors of a mesh that was only tracked hide it: held-out frames may see no more than that they are open.
+        """
+        state = self.present.solution.state
+        if not self.present.model.light.startswith("cubemap"):
+            return False
+        lights = np.split(state.light, len(self.capture.frames_of_lights))
+        return any(lamp_solid_angle(light, lamp_texels(light)) * len(light) < UNRESOLVED * 4.0 * np.pi
+                   for light in lights)
 
     def _patience(self, part: str) -> int:
         """How many candidates in a row may not serve: a cubemap that a finer one does not improve is fine enough."""

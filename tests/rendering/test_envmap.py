@@ -12,6 +12,8 @@ from shared.rendering.envmap import (
     cube_smoothness,
     cube_solid_angles,
     cube_texel,
+    lamp_solid_angle,
+    lamp_texels,
     latlong_directions,
     latlong_from_cube,
     latlong_lookup,
@@ -28,6 +30,29 @@ def smooth_light(directions):
 def test_solid_angles_cover_the_sphere():
     assert cube_solid_angles(7).sum() == pytest.approx(4 * np.pi)
     assert np.allclose(cube_solid_angles(4).reshape(6, -1).sum(1), 4 * np.pi / 6)
+
+
+def test_a_lamp_is_as_wide_as_the_disc_that_lights_alike():
+    """A disc of one radiance has its own solid angle; one that is half as bright as another beside it, (1.5)^2 / 1.25
+    of the other's."""
+    directions, radius = cube_directions(64), np.radians(12.0)
+    disc = directions @ directions[5000] > np.cos(radius)
+    light = np.repeat(np.where(disc, 30.0, 0.1)[:, None], 3, axis=1)
+    assert np.array_equal(lamp_texels(light), disc)
+    solid_angle = lamp_solid_angle(light, np.nonzero(disc)[0])
+    assert solid_angle == pytest.approx(2.0 * np.pi * (1.0 - np.cos(radius)), rel=0.02)
+    two, solid = np.nonzero(disc)[0][:2], cube_solid_angles(64)[disc][0]
+    light[two[1]] = 15.0
+    assert lamp_solid_angle(light, two) == pytest.approx(1.8 * solid, rel=0.02)
+
+
+def test_what_is_dim_or_far_off_is_not_the_lamps():
+    directions = cube_directions(16)
+    light = np.full((len(directions), 3), 0.1)
+    beside = np.argsort(-(directions @ directions[700]))
+    light[700], light[beside[1]], light[beside[2]] = 10.0, 1.1, 0.9
+    light[(directions @ directions[700]).argmin()] = 9.0
+    assert set(np.nonzero(lamp_texels(light))[0]) == {700, beside[1]}
 
 
 def test_solid_angles_add_up_and_follow_the_distance():

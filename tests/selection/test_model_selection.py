@@ -8,6 +8,7 @@ import pytest
 from field_check import below, field_faults
 from toy_capture import NOISE, even_light, hard_light, make_truth
 
+from shared.appearance.light_models import make_light_model
 from shared.appearance.problem import AppearanceSettings
 from shared.compute.run_context import RunContext
 from shared.contract.job import Parameters
@@ -18,10 +19,12 @@ from shared.inverse.lit_surface import LitSurface
 from shared.inverse.model_selection import judged_capture, select
 from shared.inverse.parameters import read_forced, read_settings
 from shared.inverse.problem import InverseSettings
+from shared.rendering.envmap import cube_directions
 from shared.report.content import selection_record
 from shared.report.page import selection_rows
 from shared.selection.candidates import (
     EXISTING,
+    FINE_LIGHTS,
     LIGHTS,
     WORTHWHILE,
     Decision,
@@ -80,8 +83,10 @@ def test_every_candidate_is_on_the_record_with_its_error_and_seconds(glossy):
     held_out = records[0]["held_out"]
     for record in records[1:]:
         assert record["fall"] == pytest.approx(held_out - record["held_out"], abs=1e-12)
-        beyond, uncertain = record["fall"] - WORTHWHILE[record["part"]] * held_out, record["standard_error"]
-        assert record["open"] == (abs(beyond) <= uncertain and (record["fall"] > 0.0 or record["part"] in EXISTING))
+        there = record["part"] in EXISTING or record["candidate"] == "cubemap_16"  # the lamp is narrow
+        worthwhile = 0.0 if there else WORTHWHILE[record["part"]]
+        beyond, uncertain = record["fall"] - worthwhile * held_out, record["standard_error"]
+        assert record["open"] == (abs(beyond) <= uncertain and (record["fall"] > 0.0 or there))
         assert record["accepted"] == (beyond > uncertain or record["open"])
         assert record["seconds"] > 0.0
         held_out = record["held_out"] if record["accepted"] else held_out
@@ -89,12 +94,15 @@ def test_every_candidate_is_on_the_record_with_its_error_and_seconds(glossy):
     assert len(selection.tried) == len(records)  # no model twice
 
 
-def tried_candidates(monkeypatch, error_of, lamp=True):
-    """What is tried, in order, where a model's error is as given for all frames; lamp: whether lights have one."""
+def tried_candidates(monkeypatch, error_of, lamp=True, unresolved=False, uneven=0.0):
+    """What is tried, in order, where a model's error is as given for all frames, but for what is uneven about those of
+    a fine light; lamp: whether lights have one, and unresolved: one that is too narrow for their texels."""
     monkeypatch.setattr(ModelSelection, "_shows_lamp", lambda self: lamp)
+    monkeypatch.setattr(ModelSelection, "_leaves_lamp_unresolved", lambda self: unresolved)
     records, frames = [], np.linspace(0.99, 1.01, 9)
-    monkeypatch.setattr(ModelSelection, "_try", lambda self, model,
-                        start: Trial(model, None, error_of(model) * frames, 0.1))
+    there = uneven * np.where(np.arange(9) % 2, 1.0, -0.7)
+    monkeypatch.setattr(ModelSelection, "_try", lambda self, model, start: Trial(
+        model, None, error_of(model) * (frames + there * (model.light in FINE_LIGHTS)), 0.1))
     ModelSelection(None, CAREFUL, allowed_candidates(CAREFUL), records.append).select()
     return [(record["candidate"], record["accepted"]) for record in records[1:]]
 
@@ -113,6 +121,39 @@ def test_a_finer_cubemap_is_tried_only_for_the_shape_of_a_lamp(monkeypatch, matt
     monkeypatch.undo()
     assert glossy[0]._shows_lamp() and not matte[0]._shows_lamp()
     assert "cubemap_16" in {model.light for model in glossy[0].tried} - {model.light for model in matte[0].tried}
+
+
+@pytest.mark.parametrize("unresolved", [True, False])
+def test_a_lamp_narrower_than_a_cubemap_shows_takes_the_finer_one_where_frames_leave_it_open(monkeypatch, unresolved):
+    """A tracked mesh's errors hide by how much the shape of a lamp would serve: here the mean error rises by chance."""
+    def error(model):
+        return {"harmonics_2": 1.0, "sun_sky": 1.0, "harmonics_4": 0.9}.get(model.light, 0.5)
+
+    found = tried_candidates(monkeypatch, error, unresolved=unresolved, uneven=0.1)
+    assert ("cubemap_8", True) in found and ("cubemap_16", unresolved) in found
+    worse = tried_candidates(monkeypatch, lambda model: error(model) + 0.1 * (model.light in FINE_LIGHTS),
+                             unresolved=unresolved, uneven=0.1)
+    assert ("cubemap_16", False) in worse  # for certain
+
+
+def test_which_lamp_a_cubemap_leaves_unresolved(glossy):
+    """A point of light and one that is as wide as a soft box, the same whichever of two lights has it."""
+    def leaves(*widths):
+        directions, lights = cube_directions(8), []
+        for width in widths:
+            lamp = np.exp((directions @ directions[100] - 1.0) / width**2)
+            lights.append(np.repeat((0.1 + 20.0 * lamp / lamp.max())[:, None], 3, axis=1))
+        params, capture = np.log(np.concatenate(lights)), glossy[0].capture
+        index = np.arange(len(capture.fitted)) % len(widths)
+        model = make_light_model("cubemap", 8, len(widths))
+        selection = ModelSelection(replace(capture, light_index=index), CAREFUL, {})
+        state = replace(glossy[0].present.solution.state, params=params, light_model=model)
+        solution = replace(glossy[0].present.solution, state=state)
+        selection.present = Trial(Model("cubemap_8", "none"), solution, np.ones(9), 0.0)
+        return selection._leaves_lamp_unresolved()
+
+    assert leaves(0.08) and not leaves(0.4)
+    assert leaves(0.4, 0.08) and leaves(0.08, 0.4) and not leaves(0.4, 0.4)
 
 
 @pytest.mark.parametrize("saved", [-0.001, 0.001])
@@ -226,7 +267,7 @@ def test_a_decision_that_stays_open_says_so(one_thread, monkeypatch, select_on):
     uneven = np.where(np.arange(9) % 2, 0.0205, 0.019)
     monkeypatch.setattr(ModelSelection, "_try", lambda self, model, start: Trial(
         model, start, frames if model.light == "harmonics_2" else uneven, 0.1))
-    monkeypatch.setattr(model_selection, "fit_all_points", lambda *_: None)
+    monkeypatch.setattr(model_selection, "fit_appearance", lambda *_, start: start)
     chosen, _ = select_on(make_truth(specular=0.0)[0], notes.append, selection=frozenset({"samples"}))
     assert chosen.candidates[1]["open"] and chosen.candidates[1]["accepted"]
     assert "accepted, where held-out frames leave it open" in notes[1]

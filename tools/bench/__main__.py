@@ -12,6 +12,7 @@ BENCHES = {
     "stress": "stress.bench:StressBench",
     "shape": "shape:ShapeBench",
     "model_selection": "model_selection:ModelSelectionBench",
+    "whole_choice": "whole_choice:WholeChoiceBench",
     "published": "published:PublishedBench",
     "compared": "published:ComparedBench",
     "tracking": "tracking:TrackingBench",
