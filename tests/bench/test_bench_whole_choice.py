@@ -67,7 +67,7 @@ def test_each_candidate_runs_once_on_each_subject_and_a_later_one_joins_them(tmp
     assert len(commands) == 6 and "--set=light_model=harmonics_4" in {*commands[4], *commands[5]}
     rows = json.loads((tmp_path / "out" / "whole_choice.json").read_text())["rows"]
     assert {found["candidate"] for found in rows} == {"auto", "full", "harmonics_4"}
-    assert "| clip | chosen |" in (tmp_path / "out" / "whole_choice.md").read_text()
+    assert "\n| clip | chosen |" in (tmp_path / "out" / "whole_choice.md").read_text()
 
 
 @pytest.mark.parametrize("candidate", CANDIDATES)

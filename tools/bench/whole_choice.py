@@ -150,7 +150,8 @@ class WholeChoiceBench(SettingsBench):
 
     def page(self, table: Table) -> str:
         compared = compare(table.rows)
-        return super().page(table) + ("\n" + markdown_table(compared) if compared else "")
+        columns = list(dict.fromkeys(name for row in compared for name in row))
+        return super().page(table) + ("\n" + markdown_table(compared, columns) if compared else "")
 
     def conclude(self, table: Table) -> int:
         compared = compare(table.rows)
