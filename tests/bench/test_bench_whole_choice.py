@@ -17,6 +17,7 @@ def tracked_run(folder: Path) -> Path:
         (folder / "work" / stage).mkdir(parents=True)
         (folder / "work" / stage / "provenance.json").write_text("{}")
         (folder / "work" / f"{stage}.stamp").write_text("stamp")
+    (folder / "work" / "export_usd.stamp").write_text("stamp")
     return folder
 
 

@@ -52,8 +52,8 @@ def prepared(tracked: Path, root: Path) -> Path:
             raise InputError("a stage has not run", where=str(tracked / folder_of(stage)),
                              expected="a run's folder with a tracked clip")
     shutil.rmtree(root, ignore_errors=True)
-    later = (f"{stage}{end}" for stage in SOLVED for end in ("", ".stamp"))
-    shutil.copytree(tracked / "work", root / "work", ignore=shutil.ignore_patterns(*later))
+    shutil.copytree(tracked / "work", root / "work",
+                    ignore=shutil.ignore_patterns("inverse_render", "inverse_render.stamp", "export_usd.stamp"))
     return root
 
 
