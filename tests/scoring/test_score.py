@@ -176,6 +176,7 @@ def test_measures_have_their_closed_forms():
     truth = np.random.default_rng(0).random((2000, 3)) * 0.6 + 0.1
     scores = measures.albedo_errors(truth, truth / GAIN, np.random.default_rng(0))
     np.testing.assert_allclose(scores["gain"], GAIN)
+    np.testing.assert_allclose(scores["median_gain"], GAIN)
     assert scores["aligned"]["delta_e2000_median"] == pytest.approx(0, abs=1e-9)
     assert scores["raw"]["delta_e2000_median"] > scores["aligned_one_gain"]["delta_e2000_median"] > 1
     values = measures.scalar_errors(truth[:, 0], 2 * truth[:, 0])

@@ -13,6 +13,7 @@ BENCHES = {
     "shape": "shape:ShapeBench",
     "model_selection": "model_selection:ModelSelectionBench",
     "whole_choice": "whole_choice:WholeChoiceBench",
+    "level": "level:LevelBench",
     "published": "published:PublishedBench",
     "compared": "published:ComparedBench",
     "tracking": "tracking:TrackingBench",

@@ -20,6 +20,8 @@ import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from queue import SimpleQueue
 from statistics import median
@@ -42,7 +44,15 @@ CANDIDATES: dict[str, dict[str, object]] = {
 }
 TRACKED = ("sample_frames", "track_landmarks", "init_albedo")
 SOLVED = ("inverse_render", "export_usd")
-SCORES = ("albedo_de", "albedo_one_gain_de", "albedo_raw_de", "surface_mm", "lobe25", "rerender_db")
+SCORES = {
+    "albedo_de": ("albedo", "aligned", "delta_e2000_median"),
+    "albedo_one_gain_de": ("albedo", "aligned_one_gain", "delta_e2000_median"),
+    "albedo_raw_de": ("albedo", "raw", "delta_e2000_median"),
+    "surface_mm": ("geometry_mm", "median"),
+    "lobe25": ("envmap", "lobe25_rel_rmse"),
+    "rerender_db": ("rerender", "psnr"),
+}
+"""{column: where tools.score has it}"""
 
 
 def prepared(tracked: Path, root: Path) -> Path:
@@ -73,10 +83,7 @@ def row_of(subject: Path, root: Path) -> dict[str, object]:
     if not (subject / "gt").is_dir():
         return row
     found = score(subject, root / folder_of("export_usd"))
-    albedo = {name: found["albedo"][name]["delta_e2000_median"] for name in ("aligned", "aligned_one_gain", "raw")}
-    values = (*albedo.values(), found["geometry_mm"]["median"], found["envmap"]["lobe25_rel_rmse"],
-              found["rerender"]["psnr"])
-    return row | dict(zip(SCORES, values, strict=True))
+    return row | {name: reduce(getitem, path, found) for name, path in SCORES.items()}
 
 
 def compare(rows: Sequence[Mapping]) -> list[dict]:
