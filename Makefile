@@ -1,10 +1,10 @@
 # make demo    set-up, then the embedded subject from clip to scores
-# make test    set-up, then the lint and all tests
+# make test    set-up, then the lint and the tests, slow ones in part
 # make test-all  installs what the optional tests need (root, Debian), then the lint and all tests in full
 # make test-random  the tests in a random order; SEED=N: that order again
 # make test-files   each test file by itself
 # make setup   the set-up alone
-# make chart   set-up, then speed against accuracy on the embedded subject (10 minutes); CASES=all SUBJECT=DIR: more
+# make chart   set-up, then speed against accuracy on the embedded subject (15 minutes); CASES=all SUBJECT=DIR: more
 # make stress  set-up, then where Limn fails and whether it says so (an hour on one core; goes on where it was stopped)
 # make audit   licences, changed files, bill of materials; ADVISORIES=all.zip: known vulnerabilities, too
 PYTHON ?= python3

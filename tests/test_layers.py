@@ -162,6 +162,15 @@ def test_a_package_says_what_it_may_import_and_in_which_order_to_read_it(folder)
     assert set(doors) - {"errors", "nothing"} == set(MAY_IMPORT[package].split())
 
 
+@pytest.mark.parametrize("folder", [p for p in PACKAGES if p.parent != REPOSITORY], ids=identity)
+def test_the_architecture_page_has_the_modules_in_the_order_of_the_package(folder):
+    text = " ".join(ast.get_docstring(ast.parse((folder / "__init__.py").read_bytes())).split())
+    order = re.search(r"Read in this order: (.*?)\.( |$)", text)[1]
+    page = (REPOSITORY / "docs" / "architecture.md").read_text(encoding="utf-8")
+    row = re.search(rf"^\| `{identity(folder)}/` \| [^|]+ \| ([^|]+) \|", page, re.MULTILINE)
+    assert row and row[1] == order
+
+
 def test_the_roots_stay_tidy():
     assert len(list((REPOSITORY / "shared").glob("*.*"))) <= 3
     assert len(list((REPOSITORY / "tools").glob("*.*"))) <= 5

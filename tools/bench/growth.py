@@ -73,7 +73,8 @@ class GrowthBench(Bench):
         shutil.rmtree(work, ignore_errors=True)
         clip = thinned(self.source, work / f"clip{count}", count)
         settings = [f"--set=sample_frames.frame_count={count}"]
-        settings += [f"--set=inverse_render.map_size={size}"] if kind == TEXELS else []
+        if kind == TEXELS:
+            settings += [f"--set=inverse_render.map_size={size}", "--set=inverse_render.fixed_parts=maps"]
         limn_run([str(clip), "--out", str(work), "--preset", self.options.preset, *settings])
         costs = {name: read_json(work / clip.name / folder_of(name) / PROVENANCE) for name in self.stages}
         entry.add(*({"kind": kind, "size": size, "stage": name, "wall_s": cost["wall_s"], "cpu_s": cost["cpu_s"],

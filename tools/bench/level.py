@@ -54,6 +54,8 @@ class LevelBench(Bench):
     """Level and tint of whole runs beside the truth."""
 
     name = "level"
+    columns = ("case", *CHANNELS, "luminance", "sigma", "prior_share", "inside_90",
+               *(f"{name}_by_squares" for name in CHANNELS), "raw_de")
 
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
@@ -79,9 +81,6 @@ class LevelBench(Bench):
         albedo = score(case, self.options.runs / case.name / folder_of("export_usd"))["albedo"]
         entry.add({**level_of(read_json(solved / "solve.json")["albedo_scale"], albedo),
                    "manifest": hash_file(solved / MANIFEST)})
-
-    def say(self, row: dict) -> list[str]:
-        return super().say({name: value for name, value in row.items() if name != "manifest"})
 
     def conclude(self, table: Table) -> int:
         errors = [abs(row[name]) for row in table.rows for name in CHANNELS]
