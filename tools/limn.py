@@ -32,7 +32,7 @@ from shared.contract.pipeline import Pipeline, load_pipeline, split_settings
 from shared.contract.subject import MOVES, TRANSFERS
 from shared.contract.wording import unknown_name
 from shared.errors import InputError, LimnError
-from tools.cli.cases import InputErrors, all_parameters, find_subjects, open_cases
+from tools.cli.cases import InputErrors, all_parameters, find_subjects, open_cases, unusable
 from tools.cli.check_export import check_exports, find_exports
 from tools.cli.housekeeping import clean, report_path
 from tools.cli.plan import plan_case, plan_lines
@@ -60,6 +60,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        print(f"limn: {unusable(error)}", file=sys.stderr)
+        return 2
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -172,7 +175,7 @@ def validate_command(args: argparse.Namespace) -> int:
 
 def run_command(args: argparse.Namespace) -> int:
     """limn run"""
-    from tools.cli.engine import EngineSettings
+    from tools.cli.engine import EngineSettings, profile_folder
     from tools.cli.gates import check_gates
     from tools.cli.resources import memory_to_give
     from tools.cli.workflow import default_summary, run_cases
@@ -180,6 +183,8 @@ def run_command(args: argparse.Namespace) -> int:
     pipeline = _pipeline_of(args)
     parameters = all_parameters(pipeline, args.preset, args.set)
     check_gates(pipeline)
+    if args.profile:
+        profile_folder(args.profile)
     opened = open_cases(find_subjects(args.subjects, args.list), args.out)
     cores = args.cores
     if cores is None and not args.profile:

@@ -1,10 +1,10 @@
 """Relief finer than the mesh, per texel, as a tangent-space normal map.
 
 With light, reflectance and mesh given, a texel's residual changes by the turn (k1, k2) of its normal towards the two
-directions of the texture, as in shape_equations; its albedo is eliminated per channel. What a vertex's neighbourhood
-shares in a frame is laid to light, pose and mesh: only finer relief counts. Equations are pooled over what the pictures
-resolve, so that no texel claims more, and the turn has a prior of none. Held-out frames say how wide the prior is and
-what share of the relief is true.
+directions of the texture, as in shared/shape/equations.py; its albedo is eliminated per channel. What a vertex's
+neighbourhood shares in a frame is laid to light, pose and mesh: only finer relief counts. Equations are pooled over
+what the pictures resolve, so that no texel claims more, and the turn has a prior of none. Held-out frames say how wide
+the prior is and what share of the relief is true.
 
 Reference: [Horn1975] (shape from shading).
 """

@@ -69,7 +69,7 @@ class Parameter:
             return None
         try:
             if self.type is str:
-                return os.path.abspath(value) if self.file and value else str(value)
+                return os.path.abspath(str(value)) if self.file and value else str(value)
             number = float(value)
             if not math.isfinite(number) or (self.type is int and number != int(number)):
                 return None

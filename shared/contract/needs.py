@@ -75,7 +75,10 @@ def scale_of(sizes: Mapping[str, str], stages: Mapping[str, Stage], parameters: 
         if stage not in stages or name not in parameters[stage]:
             known = [f"{s.name}.{p.name}" for s in stages.values() for p in s.parameters]
             raise unknown_name("parameter", source, known, f"{where}: sizes.{size}")
-        found[size] = float(parameters[stage][name])
+        value = parameters[stage][name]
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InputError("not a number", where=f"{where}: sizes.{size}", got=source, expected="a size")
+        found[size] = float(value)
     return WorkSize(**found)
 
 

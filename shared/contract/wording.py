@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 import stat
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -13,6 +12,7 @@ import yaml
 from shared.errors import InputError, shown
 
 LARGEST_YAML_BYTES = 1 << 16
+MOST_PIXELS = 1e9
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -86,9 +86,9 @@ for _kind in ("int", "float"):
 
 
 def check_pixels(values: Iterable[object], where: str, expected: str) -> None:
-    """InputError unless all are finite numbers."""
+    """InputError unless all are numbers that could be a place in a picture."""
     for value in values:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MOST_PIXELS:
             raise InputError("not a number of pixels", where=where, got=shown(value), expected=expected)
 
 
@@ -99,10 +99,11 @@ def read_yaml(path: Path) -> object:
         return yaml.load(data.decode("utf-8"), Loader=_StrictLoader)
     except UnicodeDecodeError as error:
         raise InputError("not a text file", where=str(path), expected="UTF-8") from error
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError, LookupError, ArithmeticError,
+            RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        problem = getattr(error, "problem", None) or (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError("not valid YAML", where=f"{path}{line}", got=problem) from error
 
 

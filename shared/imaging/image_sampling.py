@@ -30,7 +30,7 @@ _REMAP_COLUMNS = 1024
 
 @dataclass(frozen=True)
 class Picture:
-    """A frame ready for sampling. levels: linear RGB [H, W, 3] and halved copies of it; saturation: per level int8
+    """A frame ready for sampling. levels: linear RGB [H, W, 3] and halved copies of it; saturation: of the first, int8
     [H, W, 3], +1 where the channel is clipped, -1 where crushed; inside [H, W]: 0 at the mask's border to 1 within."""
 
     levels: tuple[np.ndarray, ...]
@@ -226,8 +226,8 @@ def is_inactive(saturation, error):
 
 
 def sample_saturation(saturation: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """A picture's saturation bounds [H, W, 3] at pixels [N, 2] -> int8 [N, 3]: +1 or -1 where a pixel that the sample
-    reads is clipped or crushed. Bounds as float32 need not be converted."""
+    """A picture's saturation bounds [H, W, 3] at pixels [N, 2] -> int8 [N, 3]: +1 where a pixel that the sample reads
+    is clipped, -1 where most are crushed. Bounds as float32 need not be converted."""
     found = remap(saturation.astype(np.float32, copy=False), pixels, cv2.INTER_LINEAR)
     return (found > 0.1).astype(np.int8) - (found < -0.5).astype(np.int8)
 

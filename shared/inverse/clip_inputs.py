@@ -165,8 +165,16 @@ def _match(frames: FrameSet, poses: dict, where: str) -> tuple[np.ndarray, np.nd
     """Poses of sampled frames [F, 4, 4], their place in the frame set [F], and which of the poses they are."""
     if "camera_from_head" not in poses:
         raise InputError("no camera_from_head", where=where, got=", ".join(sorted(poses)))
-    pose = poses["camera_from_head"].astype(np.float64)
+    pose = poses["camera_from_head"]
+    if pose.dtype.kind not in "fiu" or pose.ndim != 3 or pose.shape[1:] != (4, 4) or not np.isfinite(pose).all():
+        raise InputError("camera_from_head is no poses", where=where, got=f"{pose.dtype} {pose.shape}",
+                         expected="finite numbers [F, 4, 4]")
+    pose = pose.astype(np.float64)
     index = poses.get("frame_index", np.arange(len(pose)))
+    whole = index.dtype.kind in "fiu" and np.isfinite(index).all() and (index == np.floor(index)).all()
+    if index.shape != pose.shape[:1] or not whole or len(np.unique(index)) < len(index):
+        raise InputError("frame_index names no frames", where=where, got=f"{index.dtype} {index.shape}",
+                         expected=f"a number of a frame for each of {len(pose)} poses, none twice")
     place = {int(frame): i for i, frame in enumerate(frames.frame_index)}
     kept = [i for i, frame in enumerate(index) if int(frame) in place]
     if len(kept) < 3:

@@ -110,16 +110,25 @@ def _fans(polygons: list[list[str]]) -> np.ndarray:
 
 
 def _zero_based(indices: np.ndarray, count: int) -> np.ndarray:
-    return np.where(indices < 0, indices + count, indices - 1).astype(np.int32)
+    return np.where(indices < 0, indices + count, indices - 1)
 
 
 def _checked(mesh: Mesh, path: Path | str) -> Mesh:
+    for name, array, width, kinds in (("vertices", mesh.vertices, 3, "fiu"), ("uvs", mesh.uvs, 2, "fiu"),
+                                      ("faces", mesh.faces, 3, "iu"), ("face_uvs", mesh.face_uvs, 3, "iu")):
+        if array.dtype.kind not in kinds or array.ndim != 2 or array.shape[1] != width or not len(array):
+            raise InputError(f"{name} are no part of a mesh", where=str(path), got=f"{array.dtype} {array.shape}",
+                             expected=f"{'whole numbers' if kinds == 'iu' else 'numbers'} [n, {width}]")
+    if len(mesh.faces) != len(mesh.face_uvs):
+        raise InputError("not as many triangles of the texture as of the mesh", where=str(path), got=len(mesh.face_uvs),
+                         expected=len(mesh.faces))
     for name, indices, count in (
         ("faces", mesh.faces, len(mesh.vertices)),
         ("face_uvs", mesh.face_uvs, len(mesh.uvs)),
     ):
         if indices.min() < 0 or indices.max() >= count:
             raise InputError(f"{name} point outside the array", where=str(path), got=indices.max(), expected=count - 1)
-    if not np.isfinite(mesh.vertices).all():
-        raise InputError("vertices are not finite", where=str(path))
-    return mesh
+    for name, array in (("vertices", mesh.vertices), ("uvs", mesh.uvs)):
+        if not np.isfinite(array).all():
+            raise InputError(f"{name} are not finite", where=str(path))
+    return mesh.replace(faces=mesh.faces.astype(np.int32), face_uvs=mesh.face_uvs.astype(np.int32))

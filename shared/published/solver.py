@@ -1,7 +1,7 @@
 """The published algorithm [Xu2025]: mesh, textures and light by stochastic descent through a deferred renderer.
 
 Each iteration renders one frame: primary visibility with blended silhouettes (raster), diffuse light by
-multiple importance sampling with traced visibility and a visibility-modulated split sum (reference_shade), under a
+multiple importance sampling with traced visibility and a visibility-modulated split sum (shading), under a
 cubemap of free texels with prefiltered mips (light). Adam descends on
 
     L1 image + 0.1 mask + 10 Laplacian + 0.1 white light + 0.1 roughness variation + 0.01 squared diffuse albedo

@@ -39,12 +39,11 @@ LARGEST_SQUARED_ERROR = 0.01
 
 @dataclass(frozen=True)
 class PointEquations:
-    """Quadratic models of P points' costs in (h, k1, k2): hessian [P, 3, 3], gradient [P, 3]; albedo [P, 3]; rms
-    residuals of fitted and of held-out frames."""
+    """Quadratic models of P points' costs in (h, k1, k2): hessian [P, 3, 3], gradient [P, 3]; rms residuals of fitted
+    and of held-out frames."""
 
     hessian: np.ndarray
     gradient: np.ndarray
-    albedo: np.ndarray
     fitted: float
     held_out: float
 
@@ -138,7 +137,7 @@ def point_equations(
         np.concatenate(parts) for parts in zip(*share_out(len(blocks), linearise), strict=True)
     )
     evidence = 1.0 / variance_inflation(points, wrong, power)
-    return PointEquations(evidence * hessian.astype(np.float64), evidence * gradient.astype(np.float64), albedo,
+    return PointEquations(evidence * hessian.astype(np.float64), evidence * gradient.astype(np.float64),
                           *_rms(np.sum(sums, axis=0)))
 
 

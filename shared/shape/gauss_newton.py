@@ -178,9 +178,8 @@ class ShapeSolver:
         reflections = Reflections(shading, np.arange(len(index))) if shines else None
         return Traced(precomputed, index, transfer, shading, looks, reflections)
 
-    def examine(self, mesh: Mesh, shaped: np.ndarray, traced: Traced) -> ShapedSurface | None:
-        """Samples, shading and equations of the traced vertices; None where hardly any is seen. shaped [F] bool: the
-        faces that may move."""
+    def examine(self, mesh: Mesh, traced: Traced) -> ShapedSurface | None:
+        """Samples, shading and equations of the traced vertices; None where hardly any is seen."""
         views, settings, index = self.views, self.settings, traced.index
         points = mesh_points(mesh, index)
         samples = sample_surface(points.positions, traced.looks, views.camera_from_head, views.intrinsics)
@@ -275,7 +274,7 @@ class ShapeSolver:
         last = np.inf
         for _ in range(traces):
             traced = self.trace(mesh, shaped)
-            surface = self.examine(mesh, shaped, traced)
+            surface = self.examine(mesh, traced)
             if surface is None:
                 self.context.note(f"shape level {level}: too little of the face is seen, the mesh stays")
                 break
@@ -294,7 +293,7 @@ class ShapeSolver:
             vertices = surface.mesh.vertices + offsets[:, None] * normals
             if number + 1 == self.settings.rounds and not (self.settings.looks_back or worse):
                 return surface.mesh.replace(vertices=vertices)
-            moved = self.examine(surface.mesh.replace(vertices=vertices), shaped, traced)
+            moved = self.examine(surface.mesh.replace(vertices=vertices), traced)
             if moved is None:
                 break
             moves = np.abs(offsets[moved.index])

@@ -1,4 +1,4 @@
-"""The shape's part of inverse rendering: what is shaped, from which frames, and whether the result is kept."""
+"""The shape's part of inverse rendering: what is shaped, and in which steps."""
 
 from __future__ import annotations
 

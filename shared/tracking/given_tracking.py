@@ -18,7 +18,7 @@ from shared.io.arrays import load_arrays
 LARGEST_SKEW = 1e-3
 LEAST_FRAMES = 3
 LARGEST_BYTES = 1 << 28
-FARTHEST_PX, FARTHEST = 1e5, 1e7
+FARTHEST_PX, FARTHEST, NARROWEST_PX = 1e5, 1e7, 8.0
 
 
 def read_given_landmarks(path: Path, frame_index: np.ndarray, crop: tuple[float, float, float]):
@@ -27,6 +27,8 @@ def read_given_landmarks(path: Path, frame_index: np.ndarray, crop: tuple[float,
     place, row = _match(path, arrays["frame_index"], frame_index)
     if np.abs(arrays["landmarks_px"]).max() > FARTHEST_PX:
         raise InputError("landmarks far outside any picture", where=str(path), expected="px of the source frame")
+    if np.median(np.ptp(arrays["landmarks_px"][..., 0], axis=1)) < NARROWEST_PX:
+        raise InputError("the landmarks span no face", where=str(path), expected="px of the source frame, no shares")
     points = np.zeros((len(frame_index), LANDMARK_COUNT, 2))
     points[place] = (arrays["landmarks_px"][row] - crop[:2]) * crop[2]
     return points, _marked(place, len(frame_index))

@@ -6,13 +6,13 @@ A stage that reads a model declares it: its hash is in the stage's manifest.
 
 from __future__ import annotations
 
-import hashlib
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shared.capture.iris import IrisNetwork
 from shared.capture.landmarks import FaceNetworks
+from shared.contract.hashing import hash_file
 from shared.contract.models import HEAD_MODEL_FILE, NETWORK_FILES, models_folder
 from shared.errors import InputError
 from shared.io.arrays import load_arrays, read_json
@@ -62,15 +62,6 @@ def load_head_model() -> HeadModel:
     return HeadModel.from_arrays(load_arrays(checked_path(HEAD_MODEL_FILE)))
 
 
-def file_sha256(path: Path) -> str:
-    """SHA-256 of a file's content, hexadecimal."""
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        for block in iter(lambda: file.read(1 << 20), b""):
-            digest.update(block)
-    return digest.hexdigest()
-
-
 def checked_path(file_name: str) -> Path:
     """Path of a file in the models folder whose content is what `models.json` says."""
     folder = models_folder()
@@ -79,7 +70,7 @@ def checked_path(file_name: str) -> Path:
         if not needed.is_file():
             raise InputError("the models are not set up", where=str(needed), got="no such file", hint=_HINT)
     listed = {entry["file"]: entry["sha256"] for entry in _read_list(list_path)}
-    expected, got = listed.get(file_name, "no entry in models.json"), file_sha256(path)
+    expected, got = listed.get(file_name, "no entry in models.json"), hash_file(path)
     if got != expected:
         raise InputError(
             "a model file is damaged", where=str(path), got=f"SHA-256 {got[:16]}", expected=expected[:16], hint=_HINT

@@ -5,7 +5,8 @@ import pytest
 from shapes import sphere
 
 from shared.errors import InputError
-from shared.io.meshes import read_obj, write_obj
+from shared.io.arrays import save_arrays
+from shared.io.meshes import load_mesh, read_obj, write_obj
 
 CORNERS = "v 0 0 0\nv 1 0 0 0.5 0.5 0.5\nv 1 1 0\nv 0 1 0\nv 0 2 0\nvt 0 0\nvt 1 0\nvt 1 1 0\nvt 0 1\n"
 
@@ -40,6 +41,7 @@ def test_indices_may_count_from_the_end_and_uvs_be_left_out(tmp_path):
     (CORNERS + "f 1 2\n", "no vertices or no faces"),
     (CORNERS + "f 1 2 9\n", "point outside"),
     (CORNERS + "f 1 2 99999999999999999999\n", "not a mesh"),
+    (CORNERS + "f 1 2 4294967297\n", "point outside"),
     (CORNERS + "f 1 2 three\n", "not a mesh"),
     ("v 0 0\n" + CORNERS + "f 1 2 3\n", "not a mesh"),
     ("v 0 0 zero\n" + CORNERS + "f 1 2 3\n", "not a mesh"),
@@ -47,3 +49,23 @@ def test_indices_may_count_from_the_end_and_uvs_be_left_out(tmp_path):
 def test_what_cannot_be_read_is_one_line(tmp_path, text, message):
     with pytest.raises(InputError, match=message):
         read(tmp_path, text)
+
+
+@pytest.mark.parametrize("changes, message", [
+    ({"faces": np.zeros(0, np.int32)}, "faces are no part of a mesh"),
+    ({"faces": np.array([[0.0, 1.0, 2.0]])}, "expected whole numbers"),
+    ({"faces": np.array([["a", "b", "c"]])}, "faces are no part"),
+    ({"face_uvs": np.zeros((2, 3), np.int32)}, "not as many triangles"),
+    ({"vertices": np.zeros((3, 2))}, "vertices are no part"),
+    ({"vertices": np.full((3, 3), np.nan)}, "vertices are not finite"),
+    ({"uvs": np.full((3, 2), np.inf)}, "uvs are not finite"),
+    ({"faces": np.array([[0, 1, 3]])}, "point outside"),
+])
+def test_arrays_that_are_no_mesh_are_one_line(tmp_path, changes, message):
+    whole = {"vertices": np.eye(3), "faces": np.array([[0, 1, 2]]), "uvs": np.zeros((3, 2)),
+             "face_uvs": np.array([[0, 1, 2]])}
+    save_arrays(tmp_path / "mesh.npz", **whole)
+    assert load_mesh(tmp_path / "mesh.npz").faces.dtype == np.int32
+    save_arrays(tmp_path / "mesh.npz", **{**whole, **changes})
+    with pytest.raises(InputError, match=message):
+        load_mesh(tmp_path / "mesh.npz")

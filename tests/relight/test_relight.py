@@ -1,5 +1,7 @@
 """tools.relight: results and meshes under given lights, from given sides, as stills and videos; and what it refuses."""
 
+import shutil
+
 import av
 import numpy as np
 import OpenImageIO
@@ -8,7 +10,7 @@ from shapes import sphere
 
 from shared.geometry.mesh import Mesh
 from shared.geometry.transforms import rigid
-from shared.io.arrays import save_arrays, write_json
+from shared.io.arrays import load_arrays, save_arrays, write_json
 from shared.io.images import read_exr, read_png, write_exr
 from shared.io.meshes import save_mesh, write_obj
 from shared.rendering.envmap import latlong_directions
@@ -217,3 +219,23 @@ def test_bad_input_is_one_line(result, tmp_path, capsys, arguments, fault):
     assert code == 2 and out == []
     assert fault in err and err.count("\n") == 1 and err.startswith("error: ")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("name", "content", "fault"), [
+    ("run.json", "[]", "not a record of a run"),
+    ("poses.npz", {"frame_index": np.array(["one", "two", "six"])}, "frame_index is damaged"),
+    ("poses.npz", {"camera_from_head": np.eye(4)}, "camera_from_head is damaged"),
+    ("poses.npz", {"eye_turn": np.zeros((3, 2, 3, 3))}, "no group of an eye"),
+    ("mesh.npz", {"vertices": np.ones((3, 3))}, "all vertices of the mesh lie in one place"),
+], ids=lambda value: value if isinstance(value, str) else "")
+def test_a_damaged_result_is_one_line(result, tmp_path, capsys, name, content, fault):
+    export = shutil.copytree(result, tmp_path / "export")
+    if isinstance(content, str):
+        (export / name).write_text(content)
+    elif name == "poses.npz":
+        save_arrays(export / name, **{**load_arrays(export / name), **content})
+    else:
+        corner = np.array([[0, 1, 2]])
+        save_arrays(export / name, faces=corner, uvs=np.zeros((3, 2)), face_uvs=corner, **content)
+    code, out, err = run(capsys, export / name if name == "mesh.npz" else export, "--out", tmp_path / "out")
+    assert (code, out, err.count("\n")) == (2, [], 1) and fault in err

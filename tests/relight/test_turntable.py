@@ -164,6 +164,16 @@ def test_files_of_others_are_left_alone(base, capsys):
     assert (base / "turntable" / HEAD).read_bytes() == b"my own cut"
 
 
+def test_a_record_that_is_none_is_passed_over(base, capsys):
+    (base / "turntable" / RECORD).write_text("[]")
+    assert main(["turntable", str(base), *SMALL]) == 2
+    assert "not a file of this command" in capsys.readouterr().err
+    shutil.rmtree(base / "turntable")
+    (base / "export" / "poses.npz").unlink()
+    assert main(["turntable", str(base), *SMALL]) == 2
+    assert "no export of a head; expected poses.npz" in capsys.readouterr().err
+
+
 def test_no_export_is_one_line(tmp_path, base, capsys):
     (tmp_path / "empty").mkdir()
     assert main(["turntable", str(tmp_path / "empty"), str(base), *SMALL]) == 2

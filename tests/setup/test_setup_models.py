@@ -11,9 +11,10 @@ import pytest
 from shapes import grid_plane
 from slow import SLOW
 
+from shared.contract.hashing import hash_file
 from shared.contract.models import HEAD_MODEL_FILE, models_folder
 from shared.errors import InputError
-from shared.tracking.models import LIST_FILE, checked_path, file_sha256, load_head_model, network_path
+from shared.tracking.models import LIST_FILE, checked_path, load_head_model, network_path
 from tools.goldens.kernels import LEAST
 from tools.setup import host, models
 from tools.setup.head_model.build import MM_STEP, rounded
@@ -181,4 +182,4 @@ class TestTheSameModelOnEveryProcessor:
         done = subprocess.run([sys.executable, "-m", "tools.setup.models"], capture_output=True, text=True,
                               env=LEAST.variables() | {"LIMN_MODELS": str(tmp_path)})
         assert done.returncode == 0, done.stderr
-        assert file_sha256(tmp_path / HEAD_MODEL_FILE) == file_sha256(models_folder() / HEAD_MODEL_FILE)
+        assert hash_file(tmp_path / HEAD_MODEL_FILE) == hash_file(models_folder() / HEAD_MODEL_FILE)

@@ -207,7 +207,7 @@ def test_the_shape_goes_on_past_one_worse_step_and_keeps_the_best(toy, monkeypat
     def height(mesh):
         return int(np.rint(((mesh.vertices - toy.start.vertices) * normals).sum(1).mean()))
 
-    def examine(mesh, shaped, traced):
+    def examine(mesh, traced):
         return judged_surface(mesh, judged[height(mesh)])
 
     normals = vertex_normals(toy.start.vertices, toy.start.faces)

@@ -81,7 +81,7 @@ ELSEWHERE = np.array([3, 5, 80, 90, 120])
     ({"landmarks_px": landmarks()[:, :68]}, "another shape"), ({"landmarks_px": landmarks()[..., 0]}, "another shape"),
     ({"landmarks_px": np.zeros((5, 468, 3))}, "another shape"), ({"frame_index": np.arange(4)}, "another shape"),
     ({"landmarks_px": with_nan(landmarks())}, "not finite"), ({"frame_index": TWICE}, "named twice"),
-    ({"frame_index": ELSEWHERE}, "too few")])
+    ({"landmarks_px": landmarks() / 1000.0}, "span no face"), ({"frame_index": ELSEWHERE}, "too few")])
 def test_bad_landmarks_are_refused(tmp_path, changes, hint):
     path = landmark_file(tmp_path, **changes)
     with pytest.raises(InputError, match=hint) as error:

@@ -90,6 +90,11 @@ class Opened:
         return 1 if self.crashes else 2 if self.faults else 0
 
 
+def unusable(error: OSError, where: Path | str = "") -> InputError:
+    """What to say of a file or folder that the user named and the system refuses."""
+    return InputError("cannot be read or written", where=str(error.filename or where), got=error.strerror or str(error))
+
+
 def no_access(case: SubjectCase, error: OSError) -> InputError:
     """What to say where the subject's files cannot be read or written."""
     return InputError("cannot be read or written", where=str(error.filename or case.run.root), got=error.strerror,
@@ -113,13 +118,20 @@ def find_subjects(folders: Sequence[Path], list_file: Path | None = None) -> lis
 
 def _subjects_in(folder: Path) -> list[Path]:
     """The subjects in a folder of subjects; what this user may not look into (lost+found) is none of them."""
-    if _is_subject(folder) or not folder.is_dir():
+    if _is_subject(folder) or not _is_folder(folder):
         return []
     try:
         inside = sorted(folder.iterdir())
     except OSError as error:
         raise InputError("cannot be read", where=str(folder), got=error.strerror, hint="check permissions") from error
     return [path for path in inside if _is_subject(path)]
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except OSError:  # a name too long; whoever opens it says so
+        return False
 
 
 def _is_subject(folder: Path) -> bool:
@@ -149,6 +161,8 @@ def open_cases(folders: Sequence[Path], out: Path | None) -> Opened:
             opened.cases.append(SubjectCase(subject, RunFolder.of(subject.folder, subject.name, out)))
         except InputError as error:
             opened.faults.append((folder, error))
+        except OSError as error:
+            opened.faults.append((folder, unusable(error, folder)))
     roots = [case.run.root.resolve() for case in opened.cases]
     twice = [InputError("given twice, or two subjects of one name", where=str(case.subject.folder), hint="rename one")
              for i, case in enumerate(opened.cases) if roots[i] in set(roots[:i])]

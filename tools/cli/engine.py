@@ -26,6 +26,7 @@ from shared.contract.fork_server import Served
 from shared.contract.manifest import write_record
 from shared.contract.needs import scale_of
 from shared.contract.pipeline import REPOSITORY, Pipeline
+from shared.errors import InputError
 from tools.cli.cases import SubjectCase
 from tools.cli.resources import KINDS
 from tools.cli.watch import Track, Watch
@@ -237,9 +238,17 @@ def engine_environment(home: Path) -> dict[str, str]:
 
 
 def profile_folder(name: str) -> str:
-    """A profile of this repository by its name, else what the user means by it."""
-    own = REPOSITORY / "profiles" / name
-    return str(own) if own.is_dir() and os.sep not in name else os.path.abspath(name) if os.path.isdir(name) else name
+    """A profile of this repository by its name, else a folder, else one where Snakemake keeps them. InputError where
+    there is none."""
+    own = REPOSITORY / "profiles"
+    of_user = os.environ.get("XDG_CONFIG_HOME") or os.path.expanduser("~/.config")
+    of_host = (os.environ.get("XDG_CONFIG_DIRS") or "/etc/xdg").split(os.pathsep)
+    places = [*([own] if os.sep not in name else []), Path(), *(Path(at, "snakemake") for at in (of_user, *of_host))]
+    for place in places:
+        if (place / name).is_dir():
+            return os.path.abspath(place / name)
+    known = sorted(path.name for path in own.iterdir() if path.is_dir())
+    raise InputError("no such profile", where="--profile", got=name, expected=f"{', '.join(known)} or a folder")
 
 
 def _cancel_jobs(process: subprocess.Popen) -> None:

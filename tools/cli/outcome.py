@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -105,6 +106,7 @@ def write_summary(path: Path, outcomes: Sequence[Outcome], started: str, seconds
         write_record(temporary, record)
         temporary.replace(path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
         raise InputError("the summary cannot be written", where=str(path), got=error.strerror,
                          hint="name another place with --summary FILE") from error

@@ -57,7 +57,8 @@ def write_overview(path: Path, outcomes: Sequence[Outcome], pipeline: Pipeline) 
         temporary.write_text(page, encoding="utf-8", errors="replace")
         temporary.replace(path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
         raise InputError("the overview cannot be written", where=str(path), got=error.strerror,
                          hint="choose another place") from error
 

@@ -248,6 +248,8 @@ def default_summary(subjects: Sequence[Path], out: Path | None, given: Path | No
     if given is not None:
         if given.is_dir():
             raise InputError("a folder, not a file", where="--summary", got=given, expected="a file's name")
+        if given.parent.exists() and not given.parent.is_dir():
+            raise InputError("lies in no folder", where="--summary", got=given)
         return given
     if out is None and (len(subjects) != 1 or (subjects[0] / "subject.yaml").exists()):
         return None

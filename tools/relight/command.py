@@ -203,4 +203,8 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        refused = InputError("cannot be read or written", where=str(error.filename or ""), got=error.strerror or error)
+        print(f"error: {refused}", file=sys.stderr)
+        return 2
     return 0

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO
 
+from shared.contract.manifest import read_record
 from shared.errors import InputError
 from shared.geometry.blend_shapes import LID_ACTIONS, LidActions
 from shared.geometry.eyeballs import fit_eyeball, pitch_from_rest
@@ -17,7 +18,7 @@ from shared.geometry.transforms import WORLD_FROM_CAMERA, rotation_from_vector
 from shared.hair.hair_files import read_hair
 from shared.hair.joined import joined_maps, joined_mesh
 from shared.imaging.turning_eyes import TurningEyes
-from shared.io.arrays import load_arrays, read_json
+from shared.io.arrays import load_arrays
 from shared.io.export_maps import map_path
 from shared.io.exr_picture import read_rec709
 from shared.io.meshes import load_mesh, read_obj, read_obj_groups
@@ -93,6 +94,11 @@ def _open_result(path: Path) -> Asset:
     for name in ("camera_from_head", "frame_index", "intrinsics"):
         if name not in arrays:
             raise InputError(f"no {name}", where=str(folder / "poses.npz"), got=", ".join(sorted(arrays)))
+    count = arrays["frame_index"].size
+    for name, shape in (("camera_from_head", (count, 4, 4)), ("frame_index", (count,)), ("intrinsics", (3, 3))):
+        if arrays[name].dtype.kind not in "fiu" or arrays[name].shape != shape:
+            raise InputError(f"{name} is damaged", where=str(folder / "poses.npz"), got=arrays[name].shape,
+                             expected=shape)
     maps = {name: _read_map(folder, name) for name in MAPS}
     head = mesh
     if (hair := read_hair(folder)) is not None:
@@ -121,7 +127,9 @@ def _light_of_clip(folder: Path) -> tuple[str, NearLamp | None]:
     """What moved against the light, and the light's lamp where that stands near."""
     for name in ("run.json", "solve.json"):
         if (folder / name).is_file():
-            record = read_json(folder / name)
+            record = read_record(folder / name)
+            if record is None:
+                raise InputError("not a record of a run", where=str(folder / name))
             model, lamp = record.get("model", {}), record.get("lamp") or {}
             moves = "camera" if isinstance(model, dict) and model.get("moves") == "camera" else "head"
             return moves, NearLamp.of_record(lamp)
@@ -134,6 +142,8 @@ def _eyes_of_clip(folder: Path, head: Mesh, mesh: Mesh, poses: dict[str, np.ndar
     if "eye_turn" not in poses or not (folder / "mesh.obj").is_file():
         return {}
     groups = read_obj_groups(folder / "mesh.obj")
+    if missing := [name for name in EYES if name not in groups]:
+        raise InputError("no group of an eye", where=str(folder / "mesh.obj"), expected=", ".join(missing))
     balls = tuple(fit_eyeball(head, groups[name]) for name in EYES)
     found = {"eyes": TurningEyes(mesh, balls), "eye_turn": poses["eye_turn"]}
     lids = None
@@ -170,6 +180,8 @@ def _read_mesh(path: Path) -> Mesh:
 def _fitted(mesh: Mesh) -> Mesh:
     """Centred, MESH_HEIGHT_MM high along its longest edge of the box, and split to LEAST_VERTICES."""
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    if not (high - low).max() > 0.0:
+        raise InputError("all vertices of the mesh lie in one place", got=f"{len(mesh.vertices)} vertices")
     mesh = mesh.replace(vertices=(mesh.vertices - 0.5 * (low + high)) * (MESH_HEIGHT_MM / float((high - low).max())))
     while len(mesh.vertices) < LEAST_VERTICES:
         geometry, faces = midpoint_subdivision(mesh.faces, len(mesh.vertices))

@@ -16,10 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from shared.contract.hashing import hash_file
+from shared.contract.manifest import read_record
 from shared.errors import InputError
 from shared.geometry.eyeballs import gaze_towards
 from shared.geometry.transforms import camera_centres, world_from_head
-from shared.io.arrays import read_json, write_json
+from shared.io.arrays import write_json
 from shared.io.export_maps import MAPS
 from shared.io.exr_picture import read_rec709
 from shared.io.images import write_png
@@ -106,15 +107,16 @@ def _state_of(export: Path, settings: TurntableSettings) -> dict:
     """What the pictures depend on: the files that they show, and the settings."""
     shown = [export / "mesh.obj", export / "poses.npz", *export.glob("hair.obj"),
              *sorted((export / "maps").glob("*.exr"))]
-    if missing := [path for path in shown[:1] if not path.is_file()]:
+    if missing := [path for path in shown[:2] if not path.is_file()]:
         raise InputError("no export of a head", where=str(export), expected=missing[0].name)
     return {"export": {path.relative_to(export).as_posix(): hash_file(path) for path in shown}, **asdict(settings)}
 
 
 def _kept_files(out: Path, state: dict) -> dict[str, str]:
     """{file: SHA-256} of what need not be made again. InputError where a file is not as this command left it."""
-    record = read_json(out / RECORD) if (out / RECORD).is_file() else {}
-    recorded = record.get("files", {})
+    record = read_record(out / RECORD) or {}
+    recorded = record.get("files")
+    recorded = recorded if isinstance(recorded, dict) else {}
     found = {name: hash_file(out / name) for name in (SHEET, HEAD, LIGHT) if (out / name).exists()}
     for name, digest in found.items():
         if recorded.get(name) != digest:

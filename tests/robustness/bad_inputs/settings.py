@@ -40,6 +40,10 @@ SUBJECTS = {
     "infinity for a number": ("video: clip.mp4\ncamera: {focal_length_px: .inf}\n", "a number"),
     "a number beyond all floats": ("video: clip.mp4\ncamera: {focal_length_px: 1.0e+400}\n", "a number"),
     "a number of 40,000 digits": (f"video: clip.mp4\ncamera: {{focal_length_px: 0x{'f' * 40_000}}}\n", "a number"),
+    "a grey place of 400 digits": (f"video: clip.mp4\n{CAMERA}grey: [{'9' * 400}, 2]\n", "not a number of pixels"),
+    "a truth value that is none": ("video: clip.mp4\ncapture: {moves: !!bool perhaps}\n", "not valid YAML"),
+    "a whole number of no digits": ('video: clip.mp4\ncamera: {focal_length_px: !!int ""}\n', "not valid YAML"),
+    "a date that is none": ("video: clip.mp4\ncapture: {moves: !!timestamp soon}\n", "not valid YAML"),
     "a negative length": ("video: clip.mp4\ncamera: {focal_length_px: -900}\n", "10 .. 1e"),
     "a YAML bomb": (f"{BOMB}video: clip.mp4\n", "aliases"),
     "a YAML bomb in a value": ("video: clip.mp4\ncamera: &a [*a, *a]\n", "aliases"),
@@ -133,6 +137,11 @@ PIPELINES = {
     "pipeline: a circle": ("stages:\n  a: {needs: [b]}\n  b: {needs: [a]}\n", "circle"),
     "pipeline: a bomb": (f"{BOMB}stages: *a9\n", "aliases"),
     "pipeline: negative memory": (f"stages:\n{STAGE.replace('[]}', '[], resources: {mem_mb: -1}}')}", "resources"),
+    "pipeline: a size that is a file's name": (
+        "stages:\n  sample_frames: {}\n  track_landmarks: {needs: [sample_frames]}\n"
+        "  init_albedo: {needs: [sample_frames, track_landmarks]}\n"
+        "  inverse_render: {needs: [sample_frames, track_landmarks, init_albedo]}\n"
+        "sizes: {map_px: inverse_render.mesh}\n", "not a number"),
     "pipeline: a preset that is a number": (f"stages:\n{STAGE}presets: {{standard: 3}}\n", "not a mapping"),
     "pipeline: a value out of range": (
         f"stages:\n{STAGE}presets: {{standard: {{sample_frames: {{max_size: 1.0e+9}}}}}}\n", "128 .. 4096"),

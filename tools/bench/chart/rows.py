@@ -9,7 +9,6 @@ from shared.contract.hashing import hash_value
 from tools.bench.chart.cases import ChartCase
 from tools.bench.chart.runs import SHOWN, Solved
 
-SCHEMA = 1
 ORDER = ("sample_frames", "track_landmarks", "init_albedo", "inverse_render", "export_usd")
 EXPORT = ORDER[-1]
 COSTS = {
