@@ -43,6 +43,12 @@ def _rebuild_input_error(what: str, fields: dict) -> InputError:
     return InputError(what, **fields)
 
 
+def refused(error: OSError, where: object = "", hint: str = "") -> InputError:
+    """What to say of a file or folder that the system refuses; where: what was wanted, if the error does not say."""
+    return InputError("cannot be read or written", where=str(error.filename or where), got=error.strerror or error,
+                      hint=hint)
+
+
 def shown(value: object) -> str:
     """`value` as Python writes it, cut short: what stands in a hostile file must not fill the line, or hours."""
     try:

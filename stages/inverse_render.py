@@ -24,9 +24,9 @@ Method   What no track reaches (ears, skull, jaw) moves until the mesh's outline
          Several clips of one head under different lights are solved as one (shared/inverse/joint_clips.py): one mesh
          and one set of maps, a light and poses of each. What lies at the top is the first clip's then, and clips/ holds
          the rest.
-         Before the texels, each gets probabilities of what it shows, skin, hair, cloth and others: a mixture model of
-         how it looks beside typical skin (shared/appearance/material_mixture.py). What hides the skin, what has no
-         highlights, and the hair follow from them.
+         Before the texels, each vertex gets probabilities of what it shows, skin, hair, cloth and others: a mixture
+         model of how it looks beside typical skin (shared/appearance/material_mixture.py). What hides the skin, what
+         has no highlights, and the hair follow from them.
 Fails    poses that match no frame; too little of the face seen; results that are not finite.
 """
 

@@ -152,23 +152,25 @@ def test_modules_import_each_other_in_no_circle():
     TopologicalSorter(modules).prepare()
 
 
+def said_of(folder, words):
+    """What a package's docstring says after these words, up to the full stop."""
+    text = " ".join(ast.get_docstring(ast.parse((folder / "__init__.py").read_bytes())).split())
+    return re.search(rf"{words}: (.*?)\.( |$)", text)[1]
+
+
 @pytest.mark.parametrize("folder", [p for p in PACKAGES if p.parent != REPOSITORY], ids=identity)
 def test_a_package_says_what_it_may_import_and_in_which_order_to_read_it(folder):
     package = module_of(folder / "__init__.py")
-    text = " ".join(ast.get_docstring(ast.parse((folder / "__init__.py").read_bytes())).split())
-    order, doors = (re.search(rf"{words}: (.*?)\.( |$)", text)[1].split(", ")
-                    for words in ("Read in this order", "May import"))
+    order, doors = (said_of(folder, words).split(", ") for words in ("Read in this order", "May import"))
     assert sorted(order) == sorted({path.stem for path in folder.glob("*.py")} - {"__init__", "__main__"})
     assert set(doors) - {"errors", "nothing"} == set(MAY_IMPORT[package].split())
 
 
 @pytest.mark.parametrize("folder", [p for p in PACKAGES if p.parent != REPOSITORY], ids=identity)
 def test_the_architecture_page_has_the_modules_in_the_order_of_the_package(folder):
-    text = " ".join(ast.get_docstring(ast.parse((folder / "__init__.py").read_bytes())).split())
-    order = re.search(r"Read in this order: (.*?)\.( |$)", text)[1]
     page = (REPOSITORY / "docs" / "architecture.md").read_text(encoding="utf-8")
     row = re.search(rf"^\| `{identity(folder)}/` \| [^|]+ \| ([^|]+) \|", page, re.MULTILINE)
-    assert row and row[1] == order
+    assert row and row[1] == said_of(folder, "Read in this order")
 
 
 def test_the_roots_stay_tidy():

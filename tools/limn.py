@@ -31,8 +31,8 @@ from shared.contract.declare import parameter_table
 from shared.contract.pipeline import Pipeline, load_pipeline, split_settings
 from shared.contract.subject import MOVES, TRANSFERS
 from shared.contract.wording import unknown_name
-from shared.errors import InputError, LimnError
-from tools.cli.cases import InputErrors, all_parameters, find_subjects, open_cases, unusable
+from shared.errors import InputError, LimnError, refused
+from tools.cli.cases import InputErrors, all_parameters, find_subjects, open_cases
 from tools.cli.check_export import check_exports, find_exports
 from tools.cli.housekeeping import clean, report_path
 from tools.cli.plan import plan_case, plan_lines
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        print(f"limn: {unusable(error)}", file=sys.stderr)
+        print(f"limn: {refused(error)}", file=sys.stderr)
         return 2
 
 
@@ -183,8 +183,7 @@ def run_command(args: argparse.Namespace) -> int:
     pipeline = _pipeline_of(args)
     parameters = all_parameters(pipeline, args.preset, args.set)
     check_gates(pipeline)
-    if args.profile:
-        profile_folder(args.profile)
+    profile = profile_folder(args.profile) if args.profile else None
     opened = open_cases(find_subjects(args.subjects, args.list), args.out)
     cores = args.cores
     if cores is None and not args.profile:
@@ -201,7 +200,7 @@ def run_command(args: argparse.Namespace) -> int:
                                  for key, value in given.get(name, {}).items()]
                  for name in pipeline.stages}
     return run_cases(opened, EngineSettings(
-        pipeline, parameters, arguments, args.out, cores, memory_mb, args.threads, args.profile,
+        pipeline, parameters, arguments, args.out, cores, memory_mb, args.threads, profile,
         default_summary(args.subjects, args.out, args.summary, [case.run.root for case in opened.cases]), args.renew))
 
 

@@ -1,10 +1,12 @@
-"""Space on the disk: checked before a stage starts, and named as the fault where it ran out all the same."""
+"""The disk: its space, checked before a stage starts and named as the fault where it ran out; files replaced whole."""
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 from shared.errors import InputError
@@ -48,3 +50,17 @@ def disk_fault(error: BaseException, path: Path) -> InputError | None:
         return InputError("the disk fails", where=str(path), got=str(error),
                           hint="check the disk (dmesg), or write elsewhere with --out DIR")
     return None
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A place beside a file, to write what then takes the file's own. Where that fails (OSError) nothing is left of it,
+    and the file is as it was."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise

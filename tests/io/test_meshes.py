@@ -51,6 +51,13 @@ def test_what_cannot_be_read_is_one_line(tmp_path, text, message):
         read(tmp_path, text)
 
 
+def test_arrays_of_any_whole_type_are_a_mesh(tmp_path):
+    corner = np.array([[0, 1, 2]], np.int64)
+    save_arrays(tmp_path / "mesh.npz", vertices=np.eye(3), faces=corner, uvs=np.zeros((3, 2)), face_uvs=corner)
+    mesh = load_mesh(tmp_path / "mesh.npz")
+    assert mesh.faces.dtype == np.int32 and mesh.face_uvs.dtype == np.int32 and mesh.faces.tolist() == [[0, 1, 2]]
+
+
 @pytest.mark.parametrize("changes, message", [
     ({"faces": np.zeros(0, np.int32)}, "faces are no part of a mesh"),
     ({"faces": np.array([[0.0, 1.0, 2.0]])}, "expected whole numbers"),
@@ -64,8 +71,8 @@ def test_what_cannot_be_read_is_one_line(tmp_path, text, message):
 def test_arrays_that_are_no_mesh_are_one_line(tmp_path, changes, message):
     whole = {"vertices": np.eye(3), "faces": np.array([[0, 1, 2]]), "uvs": np.zeros((3, 2)),
              "face_uvs": np.array([[0, 1, 2]])}
-    save_arrays(tmp_path / "mesh.npz", **whole)
-    assert load_mesh(tmp_path / "mesh.npz").faces.dtype == np.int32
-    save_arrays(tmp_path / "mesh.npz", **{**whole, **changes})
+    arrays = whole | changes
+    save_arrays(tmp_path / "mesh.npz", vertices=arrays["vertices"], faces=arrays["faces"], uvs=arrays["uvs"],
+                face_uvs=arrays["face_uvs"])
     with pytest.raises(InputError, match=message):
         load_mesh(tmp_path / "mesh.npz")

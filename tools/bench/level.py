@@ -38,9 +38,8 @@ def level_of(scale: dict, albedo: dict) -> dict[str, object]:
     found = np.array(scale["skin_albedo"])
     true = found * albedo["median_gain"]
     low, high = np.array(scale["skin_albedo_90"])
-    errors = np.log(found / true)
     return {
-        **dict(zip(CHANNELS, errors, strict=True)),
+        **dict(zip(CHANNELS, np.log(found / true), strict=True)),
         "luminance": np.log((found @ LUMINANCE) / (true @ LUMINANCE)),
         "sigma": scale["log_sigma"]["luminance"],
         "prior_share": scale["prior_share"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +14,7 @@ from shared.contract.declare import Stage
 from shared.contract.folders import RunFolder
 from shared.contract.pipeline import Pipeline, split_settings
 from shared.contract.subject import Subject, load_subject
-from shared.errors import InputError, shown
+from shared.errors import InputError, refused, shown
 
 LARGEST_LIST_BYTES = 1 << 24
 
@@ -90,15 +91,9 @@ class Opened:
         return 1 if self.crashes else 2 if self.faults else 0
 
 
-def unusable(error: OSError, where: Path | str = "") -> InputError:
-    """What to say of a file or folder that the user named and the system refuses."""
-    return InputError("cannot be read or written", where=str(error.filename or where), got=error.strerror or str(error))
-
-
 def no_access(case: SubjectCase, error: OSError) -> InputError:
     """What to say where the subject's files cannot be read or written."""
-    return InputError("cannot be read or written", where=str(error.filename or case.run.root), got=error.strerror,
-                      hint="check permissions and disk, or write elsewhere with --out DIR")
+    return refused(error, case.run.root, "check permissions and disk, or write elsewhere with --out DIR")
 
 
 def one_line(error: Exception) -> str:
@@ -118,7 +113,7 @@ def find_subjects(folders: Sequence[Path], list_file: Path | None = None) -> lis
 
 def _subjects_in(folder: Path) -> list[Path]:
     """The subjects in a folder of subjects; what this user may not look into (lost+found) is none of them."""
-    if _is_subject(folder) or not _is_folder(folder):
+    if _is_subject(folder) or not os.path.isdir(folder):
         return []
     try:
         inside = sorted(folder.iterdir())
@@ -127,18 +122,8 @@ def _subjects_in(folder: Path) -> list[Path]:
     return [path for path in inside if _is_subject(path)]
 
 
-def _is_folder(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except OSError:  # a name too long; whoever opens it says so
-        return False
-
-
 def _is_subject(folder: Path) -> bool:
-    try:
-        return (folder / "subject.yaml").exists()
-    except OSError:
-        return False
+    return os.path.exists(folder / "subject.yaml")
 
 
 def _listed(path: Path) -> list[Path]:
@@ -162,7 +147,7 @@ def open_cases(folders: Sequence[Path], out: Path | None) -> Opened:
         except InputError as error:
             opened.faults.append((folder, error))
         except OSError as error:
-            opened.faults.append((folder, unusable(error, folder)))
+            opened.faults.append((folder, refused(error, folder)))
     roots = [case.run.root.resolve() for case in opened.cases]
     twice = [InputError("given twice, or two subjects of one name", where=str(case.subject.folder), hint="rename one")
              for i, case in enumerate(opened.cases) if roots[i] in set(roots[:i])]

@@ -45,7 +45,8 @@ class EngineSettings:
     """How to run. parameters: {stage: {parameter: value}}. arguments: what hands them to each stage's command line.
 
     cores: in all, None for what a profile says. memory_mb: for all jobs together. threads: of one stage, None for an
-    even share of the cores. profile: a Snakemake profile. renew: do again what other code or packages made.
+    even share of the cores. profile: folder of a
+    Snakemake profile (profile_folder). renew: do again what other code or packages made.
     """
 
     pipeline: Pipeline
@@ -201,7 +202,7 @@ def _start(home: Path, settings: EngineSettings, log: Path) -> subprocess.Popen:
     if settings.memory_mb:
         command += ["--resources", f"mem_mb={settings.memory_mb}"]
     if settings.profile:
-        command += ["--profile", profile_folder(settings.profile)]
+        command += ["--profile", settings.profile]
     return _process(command, home, log)
 
 
@@ -240,15 +241,16 @@ def engine_environment(home: Path) -> dict[str, str]:
 def profile_folder(name: str) -> str:
     """A profile of this repository by its name, else a folder, else one where Snakemake keeps them. InputError where
     there is none."""
-    own = REPOSITORY / "profiles"
+    known = {path.name: path for path in (REPOSITORY / "profiles").iterdir() if path.is_dir()}
+    if name in known:
+        return str(known[name])
     of_user = os.environ.get("XDG_CONFIG_HOME") or os.path.expanduser("~/.config")
     of_host = (os.environ.get("XDG_CONFIG_DIRS") or "/etc/xdg").split(os.pathsep)
-    places = [*([own] if os.sep not in name else []), Path(), *(Path(at, "snakemake") for at in (of_user, *of_host))]
-    for place in places:
-        if (place / name).is_dir():
-            return os.path.abspath(place / name)
-    known = sorted(path.name for path in own.iterdir() if path.is_dir())
-    raise InputError("no such profile", where="--profile", got=name, expected=f"{', '.join(known)} or a folder")
+    for folder in (name, *(os.path.join(place, "snakemake", name) for place in (of_user, *of_host))):
+        if os.path.isdir(folder):
+            return os.path.abspath(folder)
+    raise InputError("no such profile", where="--profile", got=name,
+                     expected=f"{', '.join(sorted(known))} or a folder")
 
 
 def _cancel_jobs(process: subprocess.Popen) -> None:

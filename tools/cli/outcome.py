@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from shared.contract.disk import FULL_BELOW_BYTES, free_bytes
+from shared.contract.disk import FULL_BELOW_BYTES, free_bytes, replacing
 from shared.contract.manifest import LOG, write_record
 from shared.contract.pipeline import Pipeline
 from shared.errors import InputError
@@ -100,13 +99,10 @@ def write_summary(path: Path, outcomes: Sequence[Outcome], started: str, seconds
     """summary.json: whole, or as it was before."""
     record = {"schema": SCHEMA, "started": started, "seconds": round(seconds, 1), "exit_code": exit_code(outcomes),
               "subjects": [asdict(outcome) for outcome in outcomes]}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_record(temporary, record)
-        temporary.replace(path)
+        with replacing(path) as temporary:
+            write_record(temporary, record)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
         raise InputError("the summary cannot be written", where=str(path), got=error.strerror,
                          hint="name another place with --summary FILE") from error

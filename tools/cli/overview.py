@@ -10,6 +10,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from shared.contract.declare import EXPORT, folder_of
+from shared.contract.disk import replacing
 from shared.contract.folders import RunFolder
 from shared.contract.hashing import hash_value
 from shared.contract.manifest import read_record, write_record
@@ -51,14 +52,11 @@ def values_of(run: RunFolder) -> dict[str, float]:
 def write_overview(path: Path, outcomes: Sequence[Outcome], pipeline: Pipeline) -> None:
     """Writes the page: whole, or as it was before."""
     page = overview_page(outcomes, pipeline, path.parent)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(page, encoding="utf-8", errors="replace")
-        temporary.replace(path)
+        with replacing(path) as temporary:
+            temporary.write_text(page, encoding="utf-8", errors="replace")
     except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
         raise InputError("the overview cannot be written", where=str(path), got=error.strerror,
                          hint="choose another place") from error
 
@@ -167,10 +165,5 @@ def _kept_pictures(run: RunFolder, sources: str) -> list[tuple[str, str]] | None
 
 def _keep_pictures(run: RunFolder, sources: str, pictures: Sequence[tuple[str, str]]) -> None:
     """Keeps them for the next page; results that nobody may write to are read again each time."""
-    temporary = run.work / f".{KEPT_PICTURES}.{os.getpid()}"
-    try:
+    with contextlib.suppress(OSError), replacing(run.work / KEPT_PICTURES) as temporary:
         write_record(temporary, {"sources": sources, "pictures": [list(pair) for pair in pictures]})
-        temporary.replace(run.work / KEPT_PICTURES)
-    except OSError:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)

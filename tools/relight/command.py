@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shared.errors import InputError
+from shared.errors import InputError, refused
 from shared.geometry.eyeballs import gaze_between
 from shared.geometry.raycast import pixel_directions
 from shared.geometry.transforms import WORLD_FROM_CAMERA
@@ -204,7 +204,6 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
-        refused = InputError("cannot be read or written", where=str(error.filename or ""), got=error.strerror or error)
-        print(f"error: {refused}", file=sys.stderr)
+        print(f"error: {refused(error)}", file=sys.stderr)
         return 2
     return 0
